@@ -54,7 +54,7 @@ Figures = Mapping[tuple[str, str], str]
 """What was last measured, by fault and promise: a test that is renamed keeps its figure."""
 
 
-class Chosen(NamedTuple):
+class Selected(NamedTuple):
     """A row of the page for people. `mark` is the fault as a test is marked with it, and `held` the promise, where
     several marks have the same fault."""
 
@@ -64,199 +64,199 @@ class Chosen(NamedTuple):
     held: str | None = None
 
 
-CHOSEN: Mapping[str, tuple[Chosen, ...]] = {
+SELECTED: Mapping[str, tuple[Selected, ...]] = {
     "Calibration": (
-        Chosen(
+        Selected(
             "fog, blur, wrong stamps, torn clouds or foreign pictures in a window",
             "no wrong pose is accepted",
             "windows with fog, blur, wrong stamps, torn clouds, foreign pictures",
         ),
-        Chosen(
+        Selected(
             "a window whose estimate is refused",
             "it is never served",
             "an estimate that failed",
         ),
-        Chosen(
+        Selected(
             "one wrong window between right ones",
             "the served extrinsic stays",
             "a single wrong window",
         ),
-        Chosen(
+        Selected(
             "the mount is displaced within a window",
             "the window is refused, and gives the time of the displacement",
             "a knock in the middle of a window",
         ),
-        Chosen(
+        Selected(
             "intrinsics that are wrong by 2 % or 4 px",
             "the window reports it, with the size of the error",
             "intrinsics that are off by 2 % or by four pixels",
         ),
     ),
     "Monitor and health": (
-        Chosen(
+        Selected(
             "the mount of a running service is displaced by 1°",
             "it is detected, corrected, and remembered over a restart",
             "the mount moves by a degree while the service runs",
         ),
-        Chosen(
+        Selected(
             "the mount drifts by 0.05° a minute for half an hour",
             "while the pair is healthy, the served extrinsic is at most 0.3° off",
             "a mount that drifts by 0.05° a minute, for half an hour",
         ),
-        Chosen(
+        Selected(
             "any sequence of checks, windows, commands, silence, restarts and clock steps",
             "`healthy` means that a check acquitted the served extrinsic within three periods, or where it stands",
             "20,000 such sequences",
         ),
-        Chosen(
+        Selected(
             "checks never complete, for whatever reason",
             "after three periods no pair is healthy",
             "checks that never complete, for whatever reason",
         ),
-        Chosen(
+        Selected(
             "steps in traffic, frozen sensors, wrong odometry, turned or loose mounts, another lens",
             "`healthy` for at most three periods while the extrinsic is wrong",
             "steps at a standstill and in traffic, stuck odometry, frozen sensors, turned and loose mounts, "
             "another lens",
         ),
-        Chosen(
+        Selected(
             "tunnels, open roads and nights with a right mount",
             "no false alarm; no state changes without its reason, or more than once a minute",
             "tunnels, open roads and nights with a mount that is right",
         ),
-        Chosen(
+        Selected(
             "the wall clock jumps by a year while the service runs",
             "no pair is healthy for long without a check, and no window is lost",
             "a wall clock that steps by -400 days, an hour or 100 days while the service runs",
         ),
-        Chosen(
+        Selected(
             "one LiDAR of a rig is displaced by 1.5°",
             "it alone is named, within a minute; one correction for all of its pairs",
             "the LiDAR of a running vehicle is knocked by 1.5°",
         ),
     ),
     "Data": (
-        Chosen(
+        Selected(
             "streams late and out of step, a slow worker, a stalling clock",
             "the same windows and checks as undisturbed, to the byte",
             "streams late and out of step, a slow worker, a stalling clock",
         ),
-        Chosen(
+        Selected(
             "two publishers on one topic",
             "frames of neither are used, and health names both, until one ends",
             "two publishers on one topic of a running service",
         ),
-        Chosen(
+        Selected(
             "every fault of messages at full rate for half an hour",
             "every message is accounted for, and memory stays",
             "every fault at full rate for half an hour (three minutes in the gate)",
         ),
-        Chosen(
+        Selected(
             "messages of 22 and 30 MB for 15 s",
             "memory stays bounded, and is returned within a minute",
             "15 s of messages of 22 and 30 MB",
         ),
-        Chosen(
+        Selected(
             "a ROS message of any type with any bytes",
             "a value or an error, within 5 s and 500 MB; so for every reader of foreign bytes",
             "a ROS message of any type, of any bytes",
         ),
     ),
     "Disk, restart, update": (
-        Chosen(
+        Selected(
             "`kill -9` at any moment under load",
             "nothing that a client was told is lost",
             "kill -9 at any moment under load, again and again",
         ),
-        Chosen(
+        Selected(
             "a power cut at any byte while the state is saved",
             "the last saved state, or the one that was being saved, is read",
             "a power cut at any byte of a save of the state",
         ),
-        Chosen(
+        Selected(
             "a disk that is full, read-only, or gives 100 kB/s",
             "health names it within 5 s, commands are answered within 100 ms, and all is written afterwards",
             "a disk that is full, read-only or gives 100 kB/s for 16 s",
         ),
-        Chosen(
+        Selected(
             "any bit of the state file flipped",
             "it is detected, and the previous good copy is served",
             "any bit of the state file flipped",
         ),
-        Chosen(
+        Selected(
             "an update of the software",
             "no pair becomes healthy by it, and a miscalibrated pair stays so",
             "an update of the software",
             "nothing is green that was not, and a miscalibrated pair stays so",
         ),
-        Chosen(
+        Selected(
             "an entry of the history changed, removed, swapped or inserted",
             "it is detected, and the file is kept aside",
             "an entry of the history changed, removed, swapped or put in",
         ),
     ),
     "Worker and service": (
-        Chosen(
+        Selected(
             "the worker crashes, hangs, grows too large or sends rubbish",
             "another one solves the window",
             "a worker that crashes, hangs, grows too large or sends rubbish",
         ),
-        Chosen(
+        Selected(
             "any sequence of crashes, deadlines and floods of jobs",
             "every job ends exactly once",
             "any sequence of crashes, deadlines and floods of jobs",
         ),
-        Chosen(
+        Selected(
             "a thread of the service dies",
             "health and ROS get the reason, and the process ends with an exit code of its own",
             "a thread of the service dies",
         ),
-        Chosen(
+        Selected(
             "two daemons of one vehicle, started in any order",
             "never do two serve, and always does one",
             "several daemons of a vehicle start in any order of looks",
         ),
-        Chosen(
+        Selected(
             "no router at the start, one that restarts, one that moves",
             "samples, queries and tokens come back each time",
             "no router at the start, one that restarts, and one that moves to the second endpoint",
         ),
     ),
     "Security": (
-        Chosen(
+        Selected(
             "a command with the certificate of a viewer, a sensor or a node",
             "the router does not forward it",
             "a command with the certificate of a viewer, a sensor or a node",
         ),
-        Chosen(
+        Selected(
             "an authenticated command that is changed, cut or repeated on its way",
             "it is not carried out",
             "a proven command that is changed, cut or repeated on its way",
         ),
-        Chosen(
+        Selected(
             "secrets in endpoints, Zenoh files and keys, over a whole run",
             "none is in any reply, log, command line, window, incident or state",
             "secrets in endpoints, in the Zenoh file and in private keys, over a whole life with a moved mount and a "
             "restart",
         ),
-        Chosen(
+        Selected(
             "control sequences in every text that a vehicle sends",
             "terminals show them as escapes",
             "control sequences in every text of every reply",
         ),
-        Chosen(
+        Selected(
             "the container image, with every depth network at hand",
             "it speaks to nobody but the router",
             "an image built from the Dockerfile, with every depth network at hand",
         ),
     ),
     "Fleet": (
-        Chosen(
+        Selected(
             "a Ray node dies, or falls silent, while it evaluates a window",
             "other nodes evaluate its windows, once each, within a minute",
             "a Ray node is killed, or falls silent, while it judges a window",
         ),
-        Chosen(
+        Selected(
             "a vehicle that sends no heartbeat any more",
             "its last state is shown as old, never as live",
             "a vehicle that says nothing any more",
@@ -318,14 +318,14 @@ def whole_page(rows: Sequence[Row], figures: Figures) -> str:
     return WHOLE_HEAD + "".join(lines)
 
 
-def page_of(rows: Sequence[Row], figures: Figures, chosen: Mapping[str, Sequence[Chosen]] = CHOSEN) -> str:
+def page_of(rows: Sequence[Row], figures: Figures, selected: Mapping[str, Sequence[Selected]] = SELECTED) -> str:
     """The page for people.
 
     Raises:
         ValueError: a chosen row stands for no mark, or for several.
     """
     text = PAGE_HEAD.format(count=len(rows))
-    for section, choices in chosen.items():
+    for section, choices in selected.items():
         text += f"\n## {section}\n\n| what goes wrong | what holds | test | last figure |\n|---|---|---|---|\n"
         for choice in choices:
             marked = [row for row in rows if row.fault == choice.mark and choice.held in (None, row.promise)]

@@ -53,13 +53,13 @@ def test_a_flood_of_replies_is_an_error(router: Router) -> None:
             for _ in range(bound + 1):
                 query.reply(keys.health("a"), b"")
 
-    async def asked() -> None:
+    async def requested() -> None:
         async with Vehicle("flooded", connect=router.endpoint, timeout_s=PATIENCE_S) as vehicle:
             with pytest.raises(RemoteError, match=f"more than {bound} replies"):
                 await vehicle.health("a")
 
     queryable = router.session.declare_queryable(keys.health("a"), flood)
-    asyncio.run(asked())
+    asyncio.run(requested())
     queryable.undeclare()
 
 
@@ -69,7 +69,7 @@ def answering(router: Router) -> Iterator[Callable[[str, Callable[[Request], Ans
     bus = Bus(open_session(ZenohConfig(connect=(router.endpoint,)), LimitsConfig()))
 
     def serve(key: str, answer: Callable[[Request], Answer]) -> Vehicle:
-        bus.serve(key, lambda asked: [Route(asked, answer, QueryLane.AT_ONCE)])
+        bus.serve(key, lambda requested: [Route(requested, answer, QueryLane.AT_ONCE)])
         return Vehicle("odd", connect=router.endpoint, timeout_s=PATIENCE_S)
 
     yield serve
@@ -77,19 +77,19 @@ def answering(router: Router) -> Iterator[Callable[[str, Callable[[Request], Ans
     assert bus.close(PATIENCE_S)
 
 
-async def until(changes: AsyncGenerator[PairUpdate], wanted: Callable[[PairUpdate], bool]) -> list[PairUpdate]:
+async def until(changes: AsyncGenerator[PairUpdate], expected: Callable[[PairUpdate], bool]) -> list[PairUpdate]:
     """All changes to the first that is wanted."""
     seen = []
     async with asyncio.timeout(PATIENCE_S):
         async for change in changes:
             seen.append(change)
-            if wanted(change):
+            if expected(change):
                 break
     return seen
 
 
 def test_answers_are_the_models_of_the_contract(endpoint: str) -> None:
-    async def asked() -> None:
+    async def requested() -> None:
         async with Vehicle(VEHICLE, connect=endpoint, timeout_s=PATIENCE_S) as vehicle:
             assert await vehicle.pairs() == (PAIR,)
             extrinsic, health, windows, history = await asyncio.gather(
@@ -100,11 +100,11 @@ def test_answers_are_the_models_of_the_contract(endpoint: str) -> None:
             assert windows.windows == ()
             assert history.results == ()
 
-    asyncio.run(asked())
+    asyncio.run(requested())
 
 
 def test_a_command_is_acknowledged_with_its_arguments(endpoint: str) -> None:
-    async def asked() -> None:
+    async def requested() -> None:
         async with Vehicle(VEHICLE, connect=endpoint, timeout_s=PATIENCE_S) as vehicle:
             held = await vehicle.command("hold", payload={"release": False})
             assert (held.command, held.accepted) == ("hold", True)
@@ -115,14 +115,14 @@ def test_a_command_is_acknowledged_with_its_arguments(endpoint: str) -> None:
             assert not refused.accepted
             assert refused.text
 
-    asyncio.run(asked())
+    asyncio.run(requested())
 
 
 @pytest.mark.fault(
     "a program asks for something that does not exist", "the service's code and words, as an error of coec"
 )
 def test_an_error_reply_is_an_error_with_its_code(endpoint: str) -> None:
-    async def asked() -> None:
+    async def requested() -> None:
         async with Vehicle(VEHICLE, connect=endpoint, timeout_s=PATIENCE_S) as vehicle:
             with pytest.raises(RemoteError) as refused:
                 await vehicle.command("hold", payload={"release": "perhaps"})
@@ -141,12 +141,12 @@ def test_an_error_reply_is_an_error_with_its_code(endpoint: str) -> None:
                 with pytest.raises(UsageError):
                     await anext(vehicle.changes(name))
 
-    asyncio.run(asked())
+    asyncio.run(requested())
 
 
 @pytest.mark.fault("a program asks for a vehicle that is not there", "an error that says what to check")
 def test_a_vehicle_that_is_not_there(router: Router) -> None:
-    async def asked() -> None:
+    async def requested() -> None:
         async with Vehicle("nobody", connect=router.endpoint, timeout_s=PATIENCE_S) as vehicle:
             with pytest.raises(NotFoundError, match="coec run"):
                 await vehicle.extrinsic()
@@ -154,20 +154,20 @@ def test_a_vehicle_that_is_not_there(router: Router) -> None:
                 async with asyncio.timeout(0.2):
                     await anext(vehicle.changes())
 
-    asyncio.run(asked())
+    asyncio.run(requested())
 
 
 def test_without_a_router_it_says_so() -> None:
-    async def asked() -> None:
+    async def requested() -> None:
         async with Vehicle(VEHICLE, connect=f"tcp/127.0.0.1:{free_port()}", timeout_s=0.3):
             pytest.fail("there is no router")
 
     with pytest.raises(ConnectionFailedError, match="no Zenoh router"):
-        asyncio.run(asked())
+        asyncio.run(requested())
 
 
-def test_what_is_asked_outside_of_the_connection_is_refused(endpoint: str) -> None:
-    async def asked() -> None:
+def test_what_is_requested_beyond_the_connection_is_refused(endpoint: str) -> None:
+    async def requested() -> None:
         vehicle = Vehicle(VEHICLE, connect=endpoint, timeout_s=PATIENCE_S)
         with pytest.raises(UsageError, match="async with"):
             await vehicle.extrinsic(PAIR)
@@ -179,7 +179,7 @@ def test_what_is_asked_outside_of_the_connection_is_refused(endpoint: str) -> No
         async with vehicle:
             await vehicle.extrinsic(PAIR)
 
-    asyncio.run(asked())
+    asyncio.run(requested())
 
 
 @pytest.mark.parametrize("made", [{"name": "*"}, {"name": ""}, {"name": "a", "prefix": "/b"}])
@@ -198,12 +198,12 @@ def test_a_time_that_is_none_is_refused(timeout_s: float) -> None:
 def test_rubbish_is_a_decode_error(answering: Callable[[str, Callable[[Request], Answer]], Vehicle]) -> None:
     odd = answering(Keys("coec", "odd").health("a"), lambda _: Answer(b"\xc1\x00", MSGPACK))
 
-    async def asked() -> None:
+    async def requested() -> None:
         async with odd as vehicle:
             with pytest.raises(DecodeError):
                 await vehicle.health("a")
 
-    asyncio.run(asked())
+    asyncio.run(requested())
 
 
 @pytest.mark.fault("a service does not answer a program", "the error `timeout` after the time that it gave")
@@ -213,7 +213,7 @@ def test_a_question_has_a_deadline_and_can_be_given_up(router: Router) -> None:
         key = Keys("coec", "mute").extrinsic("a")
         queryable = session.declare_queryable(key, unfinished.append, complete=True)
 
-        async def asked() -> None:
+        async def requested() -> None:
             async with Vehicle("mute", connect=router.endpoint, timeout_s=PATIENCE_S) as vehicle:
                 with pytest.raises(RemoteError) as late:
                     await vehicle.extrinsic("a", timeout_s=0.2)
@@ -226,16 +226,16 @@ def test_a_question_has_a_deadline_and_can_be_given_up(router: Router) -> None:
                     await question
                 assert time.monotonic() - began_s < PATIENCE_S / 2
 
-        asyncio.run(asked())
+        asyncio.run(requested())
         queryable.undeclare()
         unfinished.clear()
 
 
 def test_changes_begin_with_what_is_so_now_and_go_on(endpoint: str, bus: Bus) -> None:
-    async def asked() -> None:
+    async def requested() -> None:
         async with Vehicle(VEHICLE, connect=endpoint, timeout_s=PATIENCE_S) as vehicle:
             changes = vehicle.changes()
-            await until(changes, _all_told())
+            await until(changes, _all_reported())
             await changes.aclose()
             again = vehicle.changes(PAIR)
             await anext(again)
@@ -246,90 +246,90 @@ def test_changes_begin_with_what_is_so_now_and_go_on(endpoint: str, bus: Bus) ->
             assert all(change.lost == 0 for change in seen)
             await again.aclose()
 
-    asyncio.run(asked())
+    asyncio.run(requested())
 
 
 @pytest.mark.fault(
     "a service ends while a program listens", "the program is told, its loop goes on, and it hears the next service"
 )
-def test_a_service_that_ends_is_told_and_heard_again(router: Router, tmp_path: Path) -> None:
+def test_a_service_that_ends_is_reported_and_received_again(router: Router, tmp_path: Path) -> None:
     config = ZenohConfig(connect=(router.endpoint,))
 
     def alive(value: bool) -> Callable[[PairUpdate], bool]:
         return lambda change: change.kind == "alive" and change.value is value
 
-    async def asked() -> None:
+    async def requested() -> None:
         loop = asyncio.get_running_loop()
         async with Vehicle(VEHICLE, connect=router.endpoint, timeout_s=PATIENCE_S) as vehicle:
-            heard: asyncio.Queue[PairUpdate] = asyncio.Queue()
+            received: asyncio.Queue[PairUpdate] = asyncio.Queue()
 
             async def listen() -> None:
                 async for change in vehicle.changes():
-                    heard.put_nowait(change)
+                    received.put_nowait(change)
 
-            async def wait_for(wanted: Callable[[PairUpdate], bool]) -> None:
+            async def wait_for(expected: Callable[[PairUpdate], bool]) -> None:
                 async with asyncio.timeout(PATIENCE_S):
-                    while not wanted(await heard.get()):
+                    while not expected(await received.get()):
                         pass
 
             listener = asyncio.create_task(listen())
             for name in ("first", "second"):
                 service = serving(tmp_path / name, config)
                 await loop.run_in_executor(None, service.__enter__)
-                told: set[str] = set()
-                while told != {"alive", "health", "extrinsic"}:  # in whatever order
+                reported: set[str] = set()
+                while reported != {"alive", "health", "extrinsic"}:  # in whatever order
                     async with asyncio.timeout(PATIENCE_S):
-                        told.add((await heard.get()).kind)
+                        reported.add((await received.get()).kind)
                 await loop.run_in_executor(None, service.__exit__, None, None, None)
                 await wait_for(alive(False))
             assert not listener.done()
         async with asyncio.timeout(PATIENCE_S):
             await listener  # the vehicle was disconnected: the loop over it has ended
 
-    asyncio.run(asked())
+    asyncio.run(requested())
 
 
 @pytest.mark.fault(
     "a program takes changes slower than they come", "the oldest are dropped and counted; the newest is there"
 )
-def test_a_slow_listener_loses_the_oldest_and_is_told(
+def test_a_slow_listener_loses_the_oldest_and_is_reported(
     endpoint: str, bus: Bus, monkeypatch: pytest.MonkeyPatch, record_property: Callable[[str, object], None]
 ) -> None:
-    waiting, said = 4, 20
+    waiting, message = 4, 20
     monkeypatch.setattr(client, "MAX_QUEUED_CHANGES", waiting)
 
-    async def asked() -> list[PairUpdate]:
+    async def requested() -> list[PairUpdate]:
         async with Vehicle(VEHICLE, connect=endpoint, timeout_s=PATIENCE_S) as vehicle:
             health = await vehicle.health()
             slow, prompt = vehicle.changes(), vehicle.changes()
             for changes in (slow, prompt):
-                await until(changes, _all_told())
-            for since_ns in range(1, said + 1):
+                await until(changes, _all_reported())
+            for since_ns in range(1, message + 1):
                 change = health.model_copy(update={"since_ns": since_ns})
                 bus.publish(KEYS.health(PAIR), Answer(to_msgpack(change), MSGPACK))
                 await until(prompt, _says(since_ns))
-            seen = await until(slow, _says(said))
+            seen = await until(slow, _says(message))
             await slow.aclose()
             await prompt.aclose()
             return seen
 
-    seen = asyncio.run(asked())
-    told = [change.value.since_ns for change in seen if isinstance(change.value, HealthReply)]
-    assert said - waiting <= told[0]  # the last may have come when the first of those that waited was taken
-    assert told == list(range(told[0], said + 1))
-    assert [change.lost for change in seen] == [told[0] - 1, *[0] * (len(told) - 1)]
+    seen = asyncio.run(requested())
+    reported = [change.value.since_ns for change in seen if isinstance(change.value, HealthReply)]
+    assert message - waiting <= reported[0]  # the last may have come when the first of those that waited was taken
+    assert reported == list(range(reported[0], message + 1))
+    assert [change.lost for change in seen] == [reported[0] - 1, *[0] * (len(reported) - 1)]
     record_property("figure", f"{MAX_QUEUED_CHANGES} wait")
 
 
-def _all_told() -> Callable[[PairUpdate], bool]:
+def _all_reported() -> Callable[[PairUpdate], bool]:
     """Of one listener: whether it has heard all that is so now."""
     kinds: set[str] = set()
 
-    def told(change: PairUpdate) -> bool:
+    def reported(change: PairUpdate) -> bool:
         kinds.add(change.kind)
         return kinds == {"alive", "extrinsic", "health"}
 
-    return told
+    return reported
 
 
 def _says(since_ns: int) -> Callable[[PairUpdate], bool]:
@@ -337,20 +337,20 @@ def _says(since_ns: int) -> Callable[[PairUpdate], bool]:
 
 
 def test_a_listener_that_is_cancelled_hears_nothing_more(endpoint: str) -> None:
-    async def asked() -> None:
+    async def requested() -> None:
         async with Vehicle(VEHICLE, connect=endpoint, timeout_s=PATIENCE_S) as vehicle:
-            heard = asyncio.Event()
+            received = asyncio.Event()
 
             async def listen() -> None:
                 async for _ in vehicle.changes():
-                    heard.set()
+                    received.set()
 
             listener = asyncio.create_task(listen())
             async with asyncio.timeout(PATIENCE_S):
-                await heard.wait()
+                await received.wait()
             listener.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await listener
             assert (await vehicle.health()).state == "unknown"
 
-    asyncio.run(asked())
+    asyncio.run(requested())

@@ -111,7 +111,7 @@ def idle(tmp_path_factory: pytest.TempPathFactory, drive: Drive) -> Iterator[Ser
 def code(running: Service, key: str, parameters: str = "", payload: bytes | None = None) -> str:
     """Of the one reply, good or bad."""
     try:
-        return str(running.ask(key, parameters, payload)["code"])
+        return str(running.query(key, parameters, payload)["code"])
     except RemoteError as error:
         return error.reply_code
 
@@ -134,7 +134,7 @@ def test_a_drive_an_end_and_a_restart(tmp_path: Path, drive: Drive, router: Rout
         # The last pair is certain only when the streams go on, or end.
         pair = running.until(running.counters, lambda pair: pair["selected"] >= SHORT_PAIRS - 1, "the pairs")
         assert sum(pair["camera"]["losses"].values()) == 1
-        running.until(running.extrinsic, lambda told: told["percent_complete"] > 0, "how full the window is")
+        running.until(running.extrinsic, lambda reported: reported["percent_complete"] > 0, "how full the window is")
 
         changes: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
         subscriber = router.session.declare_subscriber(running.keys.extrinsic(FRONT), changes.put)
@@ -151,15 +151,15 @@ def test_a_drive_an_end_and_a_restart(tmp_path: Path, drive: Drive, router: Rout
         assert len(window.pairs) == SHORT_PAIRS
         result = read_result(path)
         assert result is not None
-        (kept,) = running.history()["results"]
-        assert kept == json.loads(result.model_dump_json())
+        (retained,) = running.history()["results"]
+        assert retained == json.loads(result.model_dump_json())
         assert (after["provenance"], after["status"]) == ("estimated", "accepted")
-        assert after["camera_from_lidar"] == kept["camera_from_lidar"]
+        assert after["camera_from_lidar"] == retained["camera_from_lidar"]
         assert after["window_id"] == window_id
         health = running.health()
         assert health["state"] == "healthy"
         assert 0 <= health["age_s"] < PATIENCE_S
-        assert running.ask(running.keys.health(REAR))["state"] == "unknown"
+        assert running.query(running.keys.health(REAR))["state"] == "unknown"
 
         (info,) = running.windows()
         assert (info["window_id"], info["pairs"], info["decision"]) == (window_id, SHORT_PAIRS, "accepted")
@@ -169,24 +169,26 @@ def test_a_drive_an_end_and_a_restart(tmp_path: Path, drive: Drive, router: Rout
 
         again = running.command("calibrate")
         assert (again["code"], again["window_id"]) == ("window_again", window_id)
-        told = running.until(running.history, lambda told: told["total"] == 2, "the second solve")
-        one, two = told["results"]
+        reported = running.until(running.history, lambda reported: reported["total"] == 2, "the second solve")
+        one, two = reported["results"]
         assert one == two, "the same window and configuration give the same result"
         with MemoryStorage(router.session, running.keys.last("*")) as storage:
             assert running.terminate() == 0
-    words = {key: heartbeat.decode_heartbeat(key, kept.payload.to_bytes()) for key, kept in storage.samples.items()}
-    assert {word.service for word in words.values()} == {"stopping"}, "it takes its leave"
-    front = words[running.keys.last(FRONT)]
+    labels = {
+        key: heartbeat.decode_heartbeat(key, retained.payload.to_bytes()) for key, retained in storage.samples.items()
+    }
+    assert {word.service for word in labels.values()} == {"stopping"}, "it takes its leave"
+    front = labels[running.keys.last(FRONT)]
     assert (front.state, front.provenance, front.windows) == ("healthy", "estimated", 1)
 
     with service(configured(tmp_path, drive, router), router) as running:
         restored = running.extrinsic()
         assert restored["camera_from_lidar"] == after["camera_from_lidar"]
         assert restored["provenance"] == "restored"
-        assert running.history()["results"] == told["results"]
+        assert running.history()["results"] == reported["results"]
         running.send(later(drive.frames, LATER_S))  # and silence: the slice ends by itself
-        told = running.until(running.history, lambda told: told["total"] == 3, "the end of the slice")
-        assert told["results"][-1]["pairs"] == SHORT_PAIRS
+        reported = running.until(running.history, lambda reported: reported["total"] == 3, "the end of the slice")
+        assert reported["results"][-1]["pairs"] == SHORT_PAIRS
         assert running.terminate() == 0
 
 
@@ -200,14 +202,14 @@ def test_a_killed_service_takes_its_worker_along_and_its_window_is_salvaged(
         running.until(running.counters, lambda pair: pair["selected"] >= SHORT_PAIRS - 1, "the pairs")
         pid = running.worker()["pid"]
         running.kill()
-        wait_until(lambda: has_ended(pid), "the end of the worker")
+        wait_until(lambda: has_finished(pid), "the end of the worker")
     with service(config, router, warm=False) as running:
-        told = running.until(running.history, lambda told: told["total"] > 0, "the solve")
-        assert told["results"][0]["pairs"] >= 3
+        reported = running.until(running.history, lambda reported: reported["total"] > 0, "the solve")
+        assert reported["results"][0]["pairs"] >= 3
         assert running.terminate() == 0
 
 
-def has_ended(pid: int) -> bool:
+def has_finished(pid: int) -> bool:
     """Gone, or waiting for a parent that collects it."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
@@ -218,13 +220,13 @@ def has_ended(pid: int) -> bool:
 @pytest.mark.fault(
     "a thread of the service dies", "the process ends with its own exit code after telling health, and ROS, why"
 )
-def test_a_thread_that_dies_ends_the_service_after_health_has_said_why(
+def test_a_thread_that_dies_ends_the_service_after_health_has_reported_why(
     tmp_path: Path, drive: Drive, router: Router
 ) -> None:
-    said: list[bytes] = []
+    message: list[bytes] = []
 
-    def hear(sample: zenoh.Sample) -> None:
-        said.append(sample.payload.to_bytes())
+    def receive(sample: zenoh.Sample) -> None:
+        message.append(sample.payload.to_bytes())
 
     config = configured(tmp_path, drive, router)
     speaking_to_ros(config, "diagnostics")
@@ -233,19 +235,19 @@ def test_a_thread_that_dies_ends_the_service_after_health_has_said_why(
         service(config, router, warm=False, program=BROKEN) as running,
     ):
         subscriber = router.session.declare_subscriber(
-            running.keys.health(FRONT), zenoh.handlers.Callback(hear, indirect=False)
+            running.keys.health(FRONT), zenoh.handlers.Callback(receive, indirect=False)
         )
         sweep = next(frame for frame in drive.frames if isinstance(frame, LidarFrame))
         router.session.put("sensors/sim/lidar", encode_lidar(sweep), encoding=MSGPACK)
         assert running.process.wait(PATIENCE_S) == ExitCode.FAULT
         subscriber.undeclare()
-    health = from_msgpack(HealthReply, said[-1])
+    health = from_msgpack(HealthReply, message[-1])
     (why,) = (reason for reason in health.reasons if reason.code == "thread_died")
     assert "broken" in why.text
     assert nodes.levels(FRONT)[-1] in (ERROR, STALE)
-    told = {value.key: value.value for value in nodes.statuses(FRONT)[-1].values}
-    assert told["service"] == "failing"
-    assert "broken" in told["reason thread_died"]
+    reported = {value.key: value.value for value in nodes.statuses(FRONT)[-1].values}
+    assert reported["service"] == "failing"
+    assert "broken" in reported["reason thread_died"]
 
 
 @pytest.mark.fault("steps of the shutdown raise", "the other steps are still done")
@@ -284,18 +286,18 @@ def test_every_wrong_question_gets_an_answer(idle: Service) -> None:
         (keys.evidence_of(FRONT, "sim-12"), ";overlay=both", "bad_request"),
     ]:
         assert code(idle, key, parameters) == expected, key
-    assert idle.ask(keys.evidence(FRONT))["events"] == []
+    assert idle.query(keys.evidence(FRONT))["events"] == []
     for name, payload in (("calibrate", b"x"), ("reset", b'{"all":true}'), ("hold", b'{"release":1}')):
         assert code(idle, keys.command(FRONT, name), payload=payload) == "bad_request"
     few = idle.command("calibrate")
     assert (few["accepted"], few["text"]) == (False, "3 more pairs needed.")
 
 
-def test_questions_about_the_whole_vehicle(idle: Service) -> None:
+def test_queries_about_the_whole_vehicle(idle: Service) -> None:
     keys = idle.keys
-    told = {str(reply.ok.key_expr) for reply in idle.session.get(f"{keys.root}/*/health") if reply.ok}
-    assert told == {keys.health(FRONT), keys.health(REAR)}
-    assert idle.ask(keys.config)["config"]["vehicle"] == idle.config.vehicle
+    reported = {str(reply.ok.key_expr) for reply in idle.session.get(f"{keys.root}/*/health") if reply.ok}
+    assert reported == {keys.health(FRONT), keys.health(REAR)}
+    assert idle.query(keys.config)["config"]["vehicle"] == idle.config.vehicle
     (metrics,) = idle.session.get(keys.metrics)
     assert metrics.ok is not None
     text = metrics.ok.payload.to_string()
@@ -315,7 +317,7 @@ def test_a_second_daemon_on_the_same_directory_is_refused(idle: Service) -> None
 
 
 @pytest.mark.fault("`insecure: true`", "health and status say so, and no key is shown")
-def test_a_door_for_everybody_is_said_and_keys_are_hidden(tmp_path: Path, drive: Drive, router: Router) -> None:
+def test_a_door_for_everybody_is_reported_and_keys_are_hidden(tmp_path: Path, drive: Drive, router: Router) -> None:
     path = configured(tmp_path, drive, router)
     config = load_config(path)
     secret = "c2VjcmV0"
@@ -327,9 +329,9 @@ def test_a_door_for_everybody_is_said_and_keys_are_hidden(tmp_path: Path, drive:
     )
     path.write_text(commented_yaml(config.model_copy(update={"zenoh": zenoh_config})))
     with service(path, None, warm=False) as running:
-        for told in (running.health(), running.status()):
-            assert "insecure" in [reason["code"] for reason in told["reasons"]]
-        (shown,) = running.ask(running.keys.config)["config"]["zenoh"]["connect"]
+        for reported in (running.health(), running.status()):
+            assert "insecure" in [reason["code"] for reason in reported["reasons"]]
+        (shown,) = running.query(running.keys.config)["config"]["zenoh"]["connect"]
         assert shown.endswith("#connect_private_key_base64=***")
         assert running.terminate() == 0
         assert secret not in running.log.read_text()
@@ -350,7 +352,7 @@ def test_a_second_daemon_of_the_vehicle_leaves_and_says_who_is_there(idle: Servi
 
 
 @pytest.mark.fault("a damaged state at the start", "health says so, and nominal is served")
-def test_a_damaged_state_is_said_and_nominal_is_served(tmp_path: Path, drive: Drive, router: Router) -> None:
+def test_a_damaged_state_is_reported_and_nominal_is_served(tmp_path: Path, drive: Drive, router: Router) -> None:
     (tmp_path / "state").mkdir()
     (tmp_path / "state" / "state.json").write_text('{"body":{}}')
     with service(configured(tmp_path, drive, router), router, warm=False) as running:

@@ -35,10 +35,10 @@ def test_every_module_that_drawing_loads_is_in_the_fingerprint() -> None:
     assert loaded <= simulated_drives.modules_behind(simulated_drives.SERVICE / "coec_lab" / "simulation" / "drive.py")
 
 
-def test_a_drawn_drive_is_the_drive() -> None:
-    drawn, drive = simulated_drives.rendered_source(TINY), open_source(TINY)
-    assert drawn.camera_stamps_ns == drive.camera_stamps_ns
-    for ours, theirs in zip(drawn.messages(), drive.messages(), strict=True):
+def test_a_rendered_drive_is_the_drive() -> None:
+    rendered, drive = simulated_drives.rendered_source(TINY), open_source(TINY)
+    assert rendered.camera_stamps_ns == drive.camera_stamps_ns
+    for ours, theirs in zip(rendered.messages(), drive.messages(), strict=True):
         if isinstance(ours, LidarFrame) and isinstance(theirs, LidarFrame):
             np.testing.assert_array_equal(ours.xyz_m, theirs.xyz_m)
         else:

@@ -22,7 +22,7 @@ def test_search_box_holds_the_starts() -> None:
     assert search(25.0).dof == 3
 
 
-def test_degrees_of_freedom_are_those_that_were_asked_for() -> None:
+def test_degrees_of_freedom_are_those_that_were_requested() -> None:
     assert configuration_of(Plan(5.0, 0.5), SolverOptions(dof=3), CalibrationConfig()).search.dof == 3
 
 

@@ -173,7 +173,7 @@ def started(*arguments: object, log: Path) -> subprocess.Popen[bytes]:
         return subprocess.Popen(command, stdout=stream, stderr=stream, env=environment())
 
 
-def ended(*arguments: object, log: Path) -> int:
+def finished(*arguments: object, log: Path) -> int:
     """Exit status of `coec ARGUMENTS`."""
     process = started(*arguments, log=log)
     try:
@@ -338,11 +338,11 @@ def spoiled(tmp_path_factory: pytest.TempPathFactory, authority: TestAuthority) 
 def test_what_a_start_cannot_read_ends_run_and_check_config_alike(
     spoiled: Mapping[str, tuple[Path, str]], spoil: Any
 ) -> None:
-    folder, words = spoiled[spoil.__name__]
+    folder, labels = spoiled[spoil.__name__]
     for command in STARTS:
-        said = Path(f"{folder}.{command}").read_text()
+        reported = Path(f"{folder}.{command}").read_text()
         code = int(Path(f"{folder}.{command}.status").read_text())
-        assert (code, words in said.replace("\n", " ")) == (ExitCode.CONFIGURATION, True), said
+        assert (code, labels in reported.replace("\n", " ")) == (ExitCode.CONFIGURATION, True), reported
 
 
 @pytest.mark.fault(
@@ -352,12 +352,12 @@ def test_what_a_start_cannot_read_ends_run_and_check_config_alike(
 def test_a_state_directory_of_others_stays_theirs(tmp_path: Path) -> None:
     path, log = written(tmp_path), tmp_path / "log"
     (tmp_path / "state").mkdir()
-    words = closed(tmp_path / "state")
+    labels = closed(tmp_path / "state")
     try:
-        assert ended("run", "--config", path, log=log) == ExitCode.CONFIGURATION
+        assert finished("run", "--config", path, log=log) == ExitCode.CONFIGURATION
     finally:
         (tmp_path / "state").chmod(0o700)
-    assert words in log.read_text()
+    assert labels in log.read_text()
 
 
 def test_a_command_line_that_does_not_fit_never_does() -> None:
@@ -372,9 +372,9 @@ def test_a_router_that_may_not_read_its_key_names_it(tmp_path: Path, authority: 
     own, log = own_certificates(tmp_path, authority), tmp_path / "log"
     text = (REPOSITORY / "deploy" / "router.json5").read_text().replace("/etc/zenoh/tls", str(own.folder))
     (tmp_path / "router.json5").write_text(text.replace(":7447", f":{free_port()}").replace(":7448", f":{free_port()}"))
-    words = closed(own.folder / "router-key.pem")
-    assert ended("router", "--config", tmp_path / "router.json5", log=log) == ExitCode.CONFIGURATION
-    assert words in log.read_text().replace("\n", " ")
+    labels = closed(own.folder / "router-key.pem")
+    assert finished("router", "--config", tmp_path / "router.json5", log=log) == ExitCode.CONFIGURATION
+    assert labels in log.read_text().replace("\n", " ")
 
 
 @pytest.mark.fault("SIGTERM while the service starts, without a router", "exit code 0: it was stopped")

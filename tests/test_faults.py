@@ -9,14 +9,14 @@ from typing import Literal
 import pytest
 
 from faults import (
-    CHOSEN,
     HELD,
     NOT_RUN,
     PAGE,
     RECORD,
-    Chosen,
+    SELECTED,
     FaultTable,
     Row,
+    Selected,
     marked_rows,
     page_of,
     record_of,
@@ -38,9 +38,9 @@ def test_the_record_has_every_marked_row_and_no_other() -> None:
     assert RECORD.read_text(encoding="utf-8") == record_of(marked_rows(), recorded_figures()), RENEW
 
 
-def test_the_page_shows_the_chosen_rows_as_they_are_recorded() -> None:
+def test_the_page_shows_the_selected_rows_as_they_are_recorded() -> None:
     assert PAGE.read_text(encoding="utf-8") == page_of(marked_rows(), recorded_figures()), RENEW
-    assert 25 <= sum(map(len, CHOSEN.values())) <= 40, "the promises that matter most, on one page"
+    assert 25 <= sum(map(len, SELECTED.values())) <= 40, "the promises that matter most, on one page"
 
 
 def test_there_are_enough_of_them_and_none_twice() -> None:
@@ -66,14 +66,14 @@ def test_a_record_is_read_back_as_it_was_written(tmp_path: Path) -> None:
     assert recorded_figures(record) == {key(ROWS[0]): "0.4 s", key(ROWS[1]): NOT_RUN}
 
 
-def test_a_page_shows_what_was_chosen_and_refuses_what_no_test_holds() -> None:
-    chosen = {"Data": (Chosen("heavy rain", "is waited for", "rain"),)}
+def test_a_page_shows_what_was_selected_and_refuses_what_no_test_holds() -> None:
+    selected = {"Data": (Selected("heavy rain", "is waited for", "rain"),)}
     assert "| heavy rain | is waited for | `tests/test_b.py::test_b` | held |\n" in page_of(
-        ROWS, {key(ROWS[1]): HELD}, chosen
+        ROWS, {key(ROWS[1]): HELD}, selected
     )
     for several in ([], [ROWS[1], ROWS[1]._replace(promise="is counted")]):
         with pytest.raises(ValueError, match="marks have the fault 'rain': one is needed"):
-            page_of(several, {}, chosen)
+            page_of(several, {}, selected)
 
 
 def test_a_mark_without_its_texts_is_refused(tmp_path: Path) -> None:
@@ -83,11 +83,11 @@ def test_a_mark_without_its_texts_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("outcome", "figures", "told"),
+    ("outcome", "figures", "reported"),
     [("passed", ["0.4 s", "0.5 s"], "0.4 s; 0.5 s"), ("passed", [], HELD), ("failed", ["9 s"], "FAILED")],
 )
 def test_a_run_writes_what_its_tests_measured_and_what_failed(
-    tmp_path: Path, outcome: Literal["passed", "failed"], figures: list[str], told: str
+    tmp_path: Path, outcome: Literal["passed", "failed"], figures: list[str], reported: str
 ) -> None:
     row = marked_rows()[0]
     record = tmp_path / "new" / "faults.json"
@@ -95,9 +95,9 @@ def test_a_run_writes_what_its_tests_measured_and_what_failed(
     marks = [("fault", json.dumps(row)), *(("figure", figure) for figure in figures)]
     report = pytest.TestReport(row.test, ("", 0, ""), {}, outcome, None, "call", user_properties=marks)
     writer.pytest_runtest_logreport(report)
-    assert recorded_figures(record)[key(row)] == told, "also where the run is ended now"
+    assert recorded_figures(record)[key(row)] == reported, "also where the run is ended now"
     writer.pytest_sessionfinish()
-    assert recorded_figures(record)[key(row)] == told
+    assert recorded_figures(record)[key(row)] == reported
 
 
 def test_a_later_run_keeps_the_figures_of_tests_that_it_leaves_out(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ def make(*arguments: object, **environment: str) -> subprocess.CompletedProcess[
     return subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ | environment)
 
 
-def test_its_certificates_pass_the_strictest_look(authority: TestAuthority) -> None:
+def test_its_certificates_pass_the_strictest_observation(authority: TestAuthority) -> None:
     for name in CERTIFICATE_NAMES:
         purpose = "sslserver" if name in ("router", "vehicle") else "sslclient"
         command = ["openssl", "verify", "-x509_strict", "-purpose", purpose, "-CAfile", "ca.pem", f"{name}.pem"]
@@ -59,16 +59,16 @@ def test_who_cannot_give_the_keys_to_the_image_is_shown_how(tmp_path: Path) -> N
     tools.mkdir()
     (tools / "chgrp").write_text("#!/bin/sh\nexit 1\n")
     (tools / "chgrp").chmod(0o755)
-    told = make(tmp_path / "a folder", PATH=f"{tools}:{os.environ['PATH']}")
-    assert told.returncode == 0, told.stderr
-    assert re.search(r"sudo chgrp 10001 .*a\\ folder/\{router,vehicle,viewer\}-key\.pem", told.stdout)
+    reported = make(tmp_path / "a folder", PATH=f"{tools}:{os.environ['PATH']}")
+    assert reported.returncode == 0, reported.stderr
+    assert re.search(r"sudo chgrp 10001 .*a\\ folder/\{router,vehicle,viewer\}-key\.pem", reported.stdout)
 
 
 def test_what_it_says_is_a_configuration_that_can_be_used(tmp_path: Path) -> None:
     folder = tmp_path / "a folder"
-    told = make(folder, "vehicle-7.example", "10.0.0.7", "fd00::7", VEHICLE="truck-7")
-    assert told.returncode == 0, told.stderr
-    (section,) = re.findall(r"^ +authority:\n(?: {17}.*\n)+", told.stdout, re.MULTILINE)
+    reported = make(folder, "vehicle-7.example", "10.0.0.7", "fd00::7", VEHICLE="truck-7")
+    assert reported.returncode == 0, reported.stderr
+    (section,) = re.findall(r"^ +authority:\n(?: {17}.*\n)+", reported.stdout, re.MULTILINE)
     file = tmp_path / "said.yaml"
     file.write_text("\n".join(line[15:] for line in section.splitlines()))
     credentials = credentials_of(AuthorityConfig.model_validate(load_yaml(file)["authority"]))
@@ -113,8 +113,8 @@ def test_without_openssl_it_says_what_to_install(tmp_path: Path) -> None:
     tools = tmp_path / "tools"
     tools.mkdir()
     for name in ("bash", "env", "mkdir"):
-        found = shutil.which(name)
-        assert found is not None
-        (tools / name).symlink_to(found)
+        result = shutil.which(name)
+        assert result is not None
+        (tools / name).symlink_to(result)
     refused = make(tmp_path / "x", PATH=str(tools))
     assert (refused.returncode, "apt-get install openssl" in refused.stderr) == (1, True)

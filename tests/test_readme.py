@@ -38,7 +38,7 @@ Durations, instants, digests, and how full the open window is depend on the mach
 
 PATIENCE_S = 900.0
 """For a block; the longest takes 40 s on two idle cores, and five minutes where seven others share them."""
-LOOK_AGAIN_S = 2
+OBSERVATION_AGAIN_S = 2
 """Between two looks at an answer that is awaited: a look takes half a second of a core, which the service needs."""
 LONG_S = 3600.0
 
@@ -83,10 +83,10 @@ class Form:
 
 def options_known(command: str) -> Form:
     """Of a command that needs more than a page can bring along: its options are looked up in its help."""
-    words = shlex.split(command)
-    options = [word for word in words if word.startswith("--")]
-    asked = " ".join(f"&& grep -q -e {option} help.txt" for option in options)
-    return Form(f"COLUMNS=200 coec {words[1]} --help > help.txt {asked}", always=True)
+    labels = shlex.split(command)
+    options = [word for word in labels if word.startswith("--")]
+    requested = " ".join(f"&& grep -q -e {option} help.txt" for option in options)
+    return Form(f"COLUMNS=200 coec {labels[1]} --help > help.txt {requested}", always=True)
 
 
 DIRECTIONS = (
@@ -160,7 +160,7 @@ FORMS = {
 
 def blocks(page: Path) -> list[Block]:
     """Of a page, in order."""
-    found: list[Block] = []
+    result: list[Block] = []
     inside: list[str] | None = None
     begin, language, goes_on = 0, "", False
     for number, line in enumerate(page.read_text().splitlines(), start=1):
@@ -175,32 +175,32 @@ def blocks(page: Path) -> list[Block]:
             typed_here = steps(inside) if language == "console" else ()
             block = Block(page, begin, language, "\n".join(inside), typed_here)
             if goes_on:
-                assert {found[-1].language, language} == {"console"}, f"{page}:{begin} goes on from nothing"
-                before = found.pop()
+                assert {result[-1].language, language} == {"console"}, f"{page}:{begin} goes on from nothing"
+                before = result.pop()
                 block = replace(before, steps=(*before.steps, *typed_here))
-            found.append(block)
+            result.append(block)
             inside, goes_on = None, False
     assert inside is None, f"the block of line {begin} has no end"
-    return found
+    return result
 
 
 def steps(lines: list[str]) -> tuple[Step, ...]:
     """The commands of a block."""
-    found: list[tuple[str, list[str]]] = []
+    result: list[tuple[str, list[str]]] = []
     going_on = False
     for line in lines:
         if going_on:
-            found[-1] = (found[-1][0].removesuffix("\\") + line.strip(), [])
+            result[-1] = (result[-1][0].removesuffix("\\") + line.strip(), [])
         elif line.startswith("$ "):
-            found.append((line.removeprefix("$ ").strip(), []))
+            result.append((line.removeprefix("$ ").strip(), []))
         else:
-            assert found, f"a console block begins with a command, not with {line!r}"
-            found[-1][1].append(line.rstrip())
-        going_on = found[-1][0].endswith("\\")
-    return tuple(Step(without_remark(command), tuple(shown)) for command, shown in found)
+            assert result, f"a console block begins with a command, not with {line!r}"
+            result[-1][1].append(line.rstrip())
+        going_on = result[-1][0].endswith("\\")
+    return tuple(Step(without_comment(command), tuple(shown)) for command, shown in result)
 
 
-def without_remark(command: str) -> str:
+def without_comment(command: str) -> str:
     """As a shell reads it."""
     return re.split(r"\s+#\s", command)[0].strip()
 
@@ -250,7 +250,7 @@ def test_a_long_block_does_what_it_says(block: Block, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("shown", "said", "equal"),
+    ("shown", "reported", "equal"),
     [
         ("rx pitch  -0.789  0.015  deg", "rx pitch   -0.777  0.014 deg ", True),
         ("rx pitch  -0.789  0.015  deg", "rx pitch   +0.789  0.015 deg ", False),
@@ -264,8 +264,8 @@ def test_a_long_block_does_what_it_says(block: Block, tmp_path: Path) -> None:
         ("sigma_deg  0.020 ≤ 0.250 ✓", "sigma_deg  0.020 ≤ 0.250 ✗", False),
     ],
 )
-def test_lines_are_compared_by_their_words_and_within_tolerance(shown: str, said: str, equal: bool) -> None:
-    assert fits(shown, said) is equal
+def test_lines_are_compared_by_their_text_and_within_tolerance(shown: str, reported: str, equal: bool) -> None:
+    assert fits(shown, reported) is equal
 
 
 def test_an_ellipsis_stands_for_any_lines_and_nothing_else_does() -> None:
@@ -308,16 +308,16 @@ def play_through(
     run_shell("\n".join(lines), cwd, {**variables, "PATH": path, "REPOSITORY": str(REPOSITORY)}, patience_s)
     other_data = False
     for number, step in enumerate(block.steps):
-        chosen = typed(step, short=short)
+        selected = typed(step, short=short)
         other_data |= short and FORMS.get(step.command, Form()).other_data
         out, err = ((spoken / f"{number}.{stream}").read_text() for stream in ("out", "err"))
-        wanted = FORMS[step.command].status if step.command in FORMS and chosen.command != step.command else 0
+        expected = FORMS[step.command].status if step.command in FORMS and selected.command != step.command else 0
         status = int((spoken / f"{number}.status").read_text())
-        assert status == wanted, f"{chosen.command}\nexit status {status}\n{out}{err}"
+        assert status == expected, f"{selected.command}\nexit status {status}\n{out}{err}"
         assert "Traceback" not in err, err
-        if chosen.shown and not other_data:
-            complaint = missing(chosen.shown, out)
-            assert complaint is None, f"{chosen.command}\n{complaint}\nit says\n{out}"
+        if selected.shown and not other_data:
+            complaint = missing(selected.shown, out)
+            assert complaint is None, f"{selected.command}\n{complaint}\nit says\n{out}"
 
 
 def typed(step: Step, *, short: bool) -> Step:
@@ -326,18 +326,18 @@ def typed(step: Step, *, short: bool) -> Step:
     return Step(form.instead, ()) if form.instead is not None and (short or form.always) else step
 
 
-def shell_lines(step: Step, form: Form, said: Path) -> list[str]:
+def shell_lines(step: Step, form: Form, reported: Path) -> list[str]:
     """The command, with what it says and its exit status in files."""
     if step.command.endswith("&"):
-        return [f": > {said}.out; : > {said}.err; echo 0 > {said}.status", step.command]
+        return [f": > {reported}.out; : > {reported}.err; echo 0 > {reported}.status", step.command]
     # A redirection of the command itself comes later, and wins.
-    told = f"{{ {step.command}\n}} > {said}.out 2> {said}.err; echo $? > {said}.status"
+    report = f"{{ {step.command}\n}} > {reported}.out 2> {reported}.err; echo $? > {reported}.status"
     if form.until is None:
-        return [told]
+        return [report]
     return [
         "while true; do",
-        told,
-        f"grep -q {shlex.quote(form.until)} {said}.out && break; sleep {LOOK_AGAIN_S}; done",
+        report,
+        f"grep -q {shlex.quote(form.until)} {reported}.out && break; sleep {OBSERVATION_AGAIN_S}; done",
     ]
 
 
@@ -379,9 +379,9 @@ LONGEST_MEASURE = 12
 """Digits: more are a name."""
 
 
-def missing(shown: tuple[str, ...], said: str) -> str | None:
+def missing(shown: tuple[str, ...], reported: str) -> str | None:
     """What of the shown lines was not said, or said beside them; None when all is as shown."""
-    rest = [line.rstrip() for line in said.splitlines() if line.strip()]
+    rest = [line.rstrip() for line in reported.splitlines() if line.strip()]
     any_lines = False
     for line in (line for line in shown if line.strip()):
         if line.strip() == ELLIPSIS:
@@ -395,17 +395,17 @@ def missing(shown: tuple[str, ...], said: str) -> str | None:
     return f"the page does not show {rest[0]!r}" if rest and not any_lines else None
 
 
-def fits(shown: str, said: str) -> bool:
+def fits(shown: str, reported: str) -> bool:
     """Whether two lines have the same words, and the same numbers within the tolerance."""
     for pattern, name in PASSING:
-        shown, said = pattern.sub(name, shown), pattern.sub(name, said)
-    if NUMBER.sub("#", shown).split() != NUMBER.sub("#", said).split():
+        shown, reported = pattern.sub(name, shown), pattern.sub(name, reported)
+    if NUMBER.sub("#", shown).split() != NUMBER.sub("#", reported).split():
         return False
-    return all(near(a, b) for a, b in zip(NUMBER.findall(shown), NUMBER.findall(said), strict=True))
+    return all(near(a, b) for a, b in zip(NUMBER.findall(shown), NUMBER.findall(reported), strict=True))
 
 
-def near(shown: str, said: str) -> bool:
+def near(shown: str, reported: str) -> bool:
     """Whether a number is the one shown, within the tolerance; so long a one is a name."""
     if len(shown) > LONGEST_MEASURE:
-        return shown == said
-    return abs(float(shown) - float(said)) <= ABSOLUTE + RELATIVE * abs(float(shown))
+        return shown == reported
+    return abs(float(shown) - float(reported)) <= ABSOLUTE + RELATIVE * abs(float(shown))

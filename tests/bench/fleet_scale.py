@@ -49,36 +49,36 @@ they cost a router's tables is more than what they cost a vehicle."""
 def main(vehicles: int = 10_000, queryables: int = 0) -> dict[str, Any]:
     """Measures, in at most three minutes."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    told: dict[str, Any] = {"vehicles": vehicles, "declarations": vehicles * (queryables + 2)}
+    reported: dict[str, Any] = {"vehicles": vehicles, "declarations": vehicles * (queryables + 2)}
     with process(_router, endpoint) as router:
-        told["router_rss_mb_empty"] = _rss_mb(router)
-        with process(_keeper, endpoint) as keeper, _watching(endpoint) as (words, roster):
+        reported["router_rss_mb_empty"] = _rss_mb(router)
+        with process(_server, endpoint) as server, _watching(endpoint) as (text, fleet_state):
             orders, answers = SPAWN.Queue(), SPAWN.Queue()
             with process(_fleet, endpoint, vehicles, queryables, orders, answers) as fleet:
-                before_s, begun_s = _cpu_s(router), time.monotonic()
+                before_s, started_s = _cpu_s(router), time.monotonic()
                 answers.get(timeout=PATIENCE_S * 3)
                 _settle(router)
-                told["declared_s"] = time.monotonic() - begun_s
-                told["router_cpu_s_declaring"] = _cpu_s(router) - before_s
-                told["router_rss_mb_declared"] = _rss_mb(router)
+                reported["declared_s"] = time.monotonic() - started_s
+                reported["router_cpu_s_declaring"] = _cpu_s(router) - before_s
+                reported["router_rss_mb_declared"] = _rss_mb(router)
                 for name, seconds in (("storm", 0.0), ("steady", STEADY_S)):
-                    told[name] = _phase(seconds, vehicles, words, roster, orders, (router, keeper, fleet))
+                    reported[name] = _phase(seconds, vehicles, text, fleet_state, orders, (router, server, fleet))
                 with _watching(endpoint) as (late, empty):
-                    begun_s = time.monotonic()
+                    started_s = time.monotonic()
                     late.initial_query_done.wait(PATIENCE_S)
-                    told["late_watcher_s"] = time.monotonic() - begun_s
-                    _hear(late, empty, [])
-                    told["late_watcher_knows"] = empty.now(time.monotonic()).known
-                begun_s = time.process_time()
-                board = roster.now(time.monotonic(), most=50)
-                told["board_ms"] = 1e3 * (time.process_time() - begun_s)
-                told["board"] = {"known": board.known, "states": board.states, "refused": board.refused}
-                told["watcher_rss_mb"] = _rss_mb(psutil.Process())
-                told["keeper_rss_mb"] = _rss_mb(keeper)
-                told["router_rss_mb_end"] = _rss_mb(router)
+                    reported["late_watcher_s"] = time.monotonic() - started_s
+                    _receive(late, empty, [])
+                    reported["late_watcher_knows"] = empty.now(time.monotonic()).known
+                started_s = time.process_time()
+                board = fleet_state.now(time.monotonic(), most=50)
+                reported["board_ms"] = 1e3 * (time.process_time() - started_s)
+                reported["board"] = {"known": board.known, "states": board.states, "refused": board.refused}
+                reported["watcher_rss_mb"] = _rss_mb(psutil.Process())
+                reported["keeper_rss_mb"] = _rss_mb(server)
+                reported["router_rss_mb_end"] = _rss_mb(router)
                 orders.put(None)
-    told["word_bytes"] = len(to_msgpack(heartbeat("v00000")))
-    return told
+    reported["word_bytes"] = len(to_msgpack(heartbeat("v00000")))
+    return reported
 
 
 @contextmanager
@@ -123,7 +123,7 @@ def _client(endpoint: str) -> zenoh.Session:
     return zenoh.open(settings)
 
 
-def _keeper(ready: Event, stop: Event, endpoint: str) -> None:
+def _server(ready: Event, stop: Event, endpoint: str) -> None:
     with _client(endpoint) as session, MemoryStorage(session, ALL.last("*")):
         ready.set()
         stop.wait()
@@ -145,13 +145,13 @@ def _fleet(ready: Event, stop: Event, endpoint: str, vehicles: int, queryables: 
         session.declare_queryable(keys.last("front"), answer, complete=True)
     answers.put("declared")
     while (seconds := orders.get()) is not None and not stop.is_set():
-        begun_s = time.monotonic()
+        started_s = time.monotonic()
         for number, (session, keys) in enumerate(every):
-            wait_s = begun_s + seconds * number / vehicles - time.monotonic()
+            wait_s = started_s + seconds * number / vehicles - time.monotonic()
             if wait_s > 0.0:
                 time.sleep(wait_s)
             session.put(keys.last("front"), _packed(keys, word), timestamp=session.new_timestamp(), express=True)
-        answers.put(time.monotonic() - begun_s)
+        answers.put(time.monotonic() - started_s)
     with suppress(zenoh.ZError):  # a router that is behind by minutes does not take leave in time
         for session in opened:
             session.close()
@@ -180,33 +180,33 @@ def _packed(keys: Keys, word: dict[str, Any]) -> bytes:
 @contextmanager
 def _watching(endpoint: str) -> Iterator[tuple[HeartbeatReceiver, FleetState]]:
     with _client(endpoint) as session, _client(endpoint) as of_tokens:
-        words = HeartbeatReceiver(session, of_tokens, ALL, PATIENCE_S)
-        with words.subscribed():
-            yield words, FleetState()
+        text = HeartbeatReceiver(session, of_tokens, ALL, PATIENCE_S)
+        with text.subscribed():
+            yield text, FleetState()
 
 
 def _phase(
     seconds: float,
     vehicles: int,
-    words: HeartbeatReceiver,
-    roster: FleetState,
+    text: HeartbeatReceiver,
+    fleet_state: FleetState,
     orders: Any,
     others: tuple[psutil.Process, ...],
 ) -> dict[str, Any]:
     """Every vehicle says its word once, in so many seconds."""
     latencies_s: list[float] = []
-    _hear(words, roster, [])
+    _receive(text, fleet_state, [])
     before = [_cpu_s(each) for each in (*others, psutil.Process())]
-    begun_s = time.monotonic()
+    started_s = time.monotonic()
     orders.put(seconds)
     quiet_s = time.monotonic()
-    while time.monotonic() - begun_s < seconds + PATIENCE_S:
-        if _hear(words, roster, latencies_s):
+    while time.monotonic() - started_s < seconds + PATIENCE_S:
+        if _receive(text, fleet_state, latencies_s):
             quiet_s = time.monotonic()
         elif len(latencies_s) >= vehicles or time.monotonic() - quiet_s > max(5.0, 0.5 * seconds):
             break
         time.sleep(0.005)
-    took_s = quiet_s - begun_s
+    took_s = quiet_s - started_s
     names = ("router", "keeper", "fleet", "watcher")
     spent = [_cpu_s(each) - cpu_s for each, cpu_s in zip((*others, psutil.Process()), before, strict=True)]
     p50, p99, most = (float(value) for value in np.quantile(latencies_s or [0.0], (0.5, 0.99, 1.0)))
@@ -221,18 +221,18 @@ def _phase(
     }
 
 
-def _hear(words: HeartbeatReceiver, roster: FleetState, latencies_s: list[float]) -> int:
+def _receive(text: HeartbeatReceiver, fleet_state: FleetState, latencies_s: list[float]) -> int:
     """What has come; how many words were said as they came."""
     count = 0
-    for came in words.pending():
-        if came.kind == "said":
+    for received in text.pending():
+        if received.kind == "said":
             count += 1
-            roster.on_heartbeat(came.key, came.payload, came.at_s)
-            latencies_s.append((time.time_ns() - decode_heartbeat(came.key, came.payload).said_ns) * 1e-9)
-        elif came.kind == "kept":
-            roster.restore(came.key, came.payload, came.at_s, time.time_ns())
-    for cause, number in words.refused().items():
-        roster.count_refused(cause, number)
+            fleet_state.on_heartbeat(received.key, received.payload, received.at_s)
+            latencies_s.append((time.time_ns() - decode_heartbeat(received.key, received.payload).said_ns) * 1e-9)
+        elif received.kind == "kept":
+            fleet_state.restore(received.key, received.payload, received.at_s, time.time_ns())
+    for cause, number in text.refused().items():
+        fleet_state.count_refused(cause, number)
     return count
 
 

@@ -15,14 +15,14 @@ LOST = 0.005
 """Share of words that a router may drop while it is busy: each is said again within its period."""
 
 
-def test_one_router_carries_the_words_of_ten_thousand_vehicles(
+def test_one_router_carries_the_text_of_ten_thousand_vehicles(
     record_property: Callable[[str, object], None],
 ) -> None:
-    told = main(VEHICLES)
-    record_property("figure", told)
-    assert told["steady"]["heard"] >= (1.0 - LOST) * VEHICLES
-    assert told["late_watcher_knows"] == VEHICLES
-    assert told["board"]["known"] == VEHICLES
-    assert told["board"]["refused"] == {}
+    reported = main(VEHICLES)
+    record_property("figure", reported)
+    assert reported["steady"]["heard"] >= (1.0 - LOST) * VEHICLES
+    assert reported["late_watcher_knows"] == VEHICLES
+    assert reported["board"]["known"] == VEHICLES
+    assert reported["board"]["refused"] == {}
     for name in ("router_rss_mb_end", "keeper_rss_mb", "watcher_rss_mb"):
-        assert told[name] < 1000.0, name
+        assert reported[name] < 1000.0, name

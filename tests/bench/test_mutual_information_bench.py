@@ -129,10 +129,10 @@ def test_ratios_to_the_plain_forms() -> None:
             least_s = {name: min(least_s[name], fastest_s(*call)) for name, call in calls.items()}
     finally:
         numba.set_num_threads(threads)
-    kept = {name: least_s[name] / least_s["kernel"] / usual for name, usual in USUAL_RATIOS.items()}
-    kept_of_bare = least_s["bare"] / least_s["kernel"] / USUAL_SHARE
-    print(f"\n{least_s} s; of the usual ratios are left: {kept}, to the bare loop {kept_of_bare:.2f}")
-    assert max(min(kept.values()), kept_of_bare) >= REGRESSION
+    retained = {name: least_s[name] / least_s["kernel"] / usual for name, usual in USUAL_RATIOS.items()}
+    retained_of_bare = least_s["bare"] / least_s["kernel"] / USUAL_SHARE
+    print(f"\n{least_s} s; of the usual ratios are left: {retained}, to the bare loop {retained_of_bare:.2f}")
+    assert max(min(retained.values()), retained_of_bare) >= REGRESSION
 
 
 @pytest.mark.parametrize("count", [5, 25, 50, 200])

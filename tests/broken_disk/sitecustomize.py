@@ -101,13 +101,13 @@ def _naming(name: str) -> Any:
 
 
 def _statvfs(path: Any) -> os.statvfs_result:
-    found: os.statvfs_result = _real["statvfs"](path)
+    result: os.statvfs_result = _real["statvfs"](path)
     state = _state() if _below(os.path.join(path, "x")) else "well"  # noqa: PTH118
     if state == "full":
-        return os.statvfs_result((*found[:4], 0, *found[5:]))
+        return os.statvfs_result((*result[:4], 0, *result[5:]))
     if state == "read-only":
-        return os.statvfs_result((*found[:8], found.f_flag | os.ST_RDONLY, *found[9:]))
-    return found
+        return os.statvfs_result((*result[:8], result.f_flag | os.ST_RDONLY, *result[9:]))
+    return result
 
 
 class _File(io.FileIO):

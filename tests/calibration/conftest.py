@@ -54,7 +54,7 @@ def sharp_edges(sharp_street: Window) -> EdgeCue:
     rig, pairs, images = sharp_street.rig, sharp_street.pairs, GreyImages(LimitsConfig())
     return build_edges(
         pairs,
-        lambda frame, chosen: compensate(pairs[frame], rig, enabled=True, selection=chosen),
+        lambda frame, selected: compensate(pairs[frame], rig, enabled=True, selection=selected),
         [images.grey(pair.camera) for pair in pairs],
         rig,
     )

@@ -139,7 +139,7 @@ def test_depth_of_other_frames_is_not_believed(street: Window, stereo: DepthMode
     assert "mi_over_unrelated" in {reason.code for reason in verdict.reasons}
 
 
-def test_a_truth_outside_the_box_is_not_believed(street: Window, stereo: DepthModel) -> None:
+def test_a_truth_beyond_the_box_is_not_believed(street: Window, stereo: DepthModel) -> None:
     config = CalibrationConfig(objective=MI, search=SearchConfig(rotation_deg=2.0))
     estimate = solve(from_start(street, 0, 6, 0), stereo, config)
     assert estimate.optimum.stop_reason is StopReason.AT_BOUND
@@ -169,7 +169,7 @@ def test_sigma_covers_the_error(street: Window, stereo: DepthModel) -> None:
     assert np.isnan(estimate.sigma[3:]).all()
 
 
-def test_frames_that_are_one_look_claim_less_of_where_the_camera_is(
+def test_frames_that_are_one_observation_claim_less_of_where_the_camera_is(
     sharp_street: Window, stereo: DepthModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = CalibrationConfig(search=SearchConfig(dof=6, reach_deg=5.0))
@@ -210,22 +210,22 @@ def test_masked_pixels_do_not_count(street: Window, stereo: DepthModel) -> None:
     assert 0 < solve(masked, stereo).optimum.points_in_view < 0.7 * solve(street, stereo).optimum.points_in_view
 
 
-def test_progress_is_told(street: Window, stereo: DepthModel) -> None:
+def test_progress_is_reported(street: Window, stereo: DepthModel) -> None:
     class Listener:
         def __init__(self) -> None:
-            self.heard: dict[str, int] = {}
+            self.steps: dict[str, int] = {}
 
         def step(self, stage: str, done: int, total: int) -> None:
             assert 0 < done <= total
-            self.heard[stage] = done
+            self.steps[stage] = done
 
     listener = Listener()
     estimate = calibrate(street, stereo, GREY, CONFIG, listener)
-    assert listener.heard["depth"] == len(street.pairs)
-    assert listener.heard["search"] == estimate.optimum.evaluations
+    assert listener.steps["depth"] == len(street.pairs)
+    assert listener.steps["search"] == estimate.optimum.evaluations
 
 
-def knocked(window: Window, first_late: int, turn_deg: float) -> Window:
+def displaced(window: Window, first_late: int, turn_deg: float) -> Window:
     """The window as if the mount had turned in pitch before the pair `first_late`: its sweeps are turned back."""
     T_before = window.rig.T_camera_lidar_nominal
     T_after = se3.perturb(T_before, np.radians([turn_deg, 0.0, 0.0, 0.0, 0.0, 0.0]))
@@ -240,14 +240,14 @@ def knocked(window: Window, first_late: int, turn_deg: float) -> Window:
 def sparse(window: Window, knock: int) -> Window:
     """The window of every other pair, those it leaves out lying between, as if the mount had turned before the pair
     `knock`."""
-    pairs = knocked(window, knock, 2.0).pairs
+    pairs = displaced(window, knock, 2.0).pairs
     return replace(window, pairs=pairs[::2], between=pairs[1::2])
 
 
 @pytest.mark.fault(
     "a knock between two pairs of a window that lie far apart", "thinned pairs between the two date the knock"
 )
-def test_pairs_between_those_of_the_window_tell_when_the_knock_was(
+def test_pairs_between_those_of_the_window_report_when_the_displacement_was(
     sharp_street: Window, stereo: DepthModel, record_property: Callable[[str, object], None]
 ) -> None:
     stamps_ns = [pair.stamp_ns for pair in sharp_street.pairs]
@@ -256,8 +256,8 @@ def test_pairs_between_those_of_the_window_tell_when_the_knock_was(
     assert moved is not None
     assert (moved.last_before_ns, moved.first_after_ns) == (stamps_ns[4], stamps_ns[5])
     assert moved.pairs_after == 2, "pairs between are not kept for the next window"
-    told_s, apart_s = (moved.first_after_ns - moved.last_before_ns) / 1e9, (stamps_ns[6] - stamps_ns[4]) / 1e9
-    record_property("figure", f"{told_s:.0f} s of {apart_s:.0f} s")
+    reported_s, separation_s = (moved.first_after_ns - moved.last_before_ns) / 1e9, (stamps_ns[6] - stamps_ns[4]) / 1e9
+    record_property("figure", f"{reported_s:.0f} s of {separation_s:.0f} s")
 
 
 @pytest.mark.fault("a picture between those of a window cannot be decoded", "it is passed over")
@@ -276,7 +276,7 @@ def test_a_pair_between_that_cannot_be_decoded_is_passed_over(
 
 @pytest.mark.fault("a knock in the middle of a window", "the window is refused, and says when it was")
 def test_a_window_that_holds_a_knock_is_refused_and_says_when_it_was(sharp_street: Window, stereo: DepthModel) -> None:
-    estimate = solve(knocked(sharp_street, 7, 2.0), stereo, CalibrationConfig())
+    estimate = solve(displaced(sharp_street, 7, 2.0), stereo, CalibrationConfig())
     assert estimate.verdict.decision is Decision.FAILED
     (reason,) = (reason for reason in estimate.verdict.reasons if reason.code == "moved_within_window")
     assert "between 42.0 and 49.0 s after its first pair" in reason.text

@@ -44,11 +44,11 @@ def sixteen_beams(window: Window) -> Window:
     return replace(window, pairs=tuple(pairs))
 
 
-def test_all_beams_carry_the_depth_witness_in_equal_shares(street: Window) -> None:
+def test_all_beams_carry_the_depth_cue_in_equal_shares(street: Window) -> None:
     window = sixteen_beams(street)
-    sight = WindowData(window, False, Flat(), GreyImages(LimitsConfig()), Silence())
+    window_data = WindowData(window, False, Flat(), GreyImages(LimitsConfig()), Silence())
     at_most = len(window.pairs) * BEAMS * FIRINGS // 2
-    frames = depth_features(sight, window.T_camera_lidar_start, at_most)
+    frames = depth_features(window_data, window.T_camera_lidar_start, at_most)
     assert sum(len(frame.xyz_m) for frame in frames) == at_most
     for frame in frames:
         sines = frame.xyz_m[:, 2] / lengths(frame.xyz_m)

@@ -43,7 +43,7 @@ def test_every_figure_is_explained_and_no_other() -> None:
     assert [known for known in FIGURES if not any(re.fullmatch(name, known) for name in made)] == []
 
 
-def test_what_is_said_are_sentences() -> None:
+def test_what_is_reported_are_sentences() -> None:
     for figure in FIGURES.values():
         assert figure.measures.endswith(".")
         assert figure.advice.endswith(".")

@@ -179,7 +179,7 @@ def test_a_failed_estimate_is_never_served(before: PairState) -> None:
     "code", ["overlap", "range_edges", "edge_contrast", "runner_up", "mi_over_unrelated", "sigma_deg"]
 )
 @pytest.mark.parametrize("before", [initial_state(RIG), HEALTHY, watched(HEALTHY, *flagged_from(200, 3))])
-def test_a_window_that_cannot_tell_is_no_evidence(before: PairState, code: str) -> None:
+def test_a_window_that_cannot_decide_is_no_evidence(before: PairState, code: str) -> None:
     refused = estimate(3.0, 300, Decision.FAILED)
     verdict = Verdict(Decision.FAILED, (), (Reason(code, "too little"), Reason("newton_step_deg", "sloped")))
     state = solved(before, replace(refused, verdict=verdict))
@@ -238,21 +238,21 @@ def test_a_window_at_whose_end_the_camera_is_where_it_is_served_speaks_against_n
     assert urgent_window_since(state) is None
 
 
-def test_a_window_that_cannot_tell_for_another_reason_is_no_witness_of_a_knock() -> None:
-    knocked = moved_within(0.5, 3.0)
-    doubtful = replace(knocked, verdict=replace(knocked.verdict, reasons=(KNOCK, OVERLAP)))
+def test_a_window_that_cannot_decide_for_another_reason_is_no_cue_of_a_displacement() -> None:
+    displaced = moved_within(0.5, 3.0)
+    doubtful = replace(displaced, verdict=replace(displaced.verdict, reasons=(KNOCK, OVERLAP)))
     state = solved(HEALTHY, doubtful)
     assert state.health is HealthState.HEALTHY
     assert urgent_window_since(state) is None
 
 
-def test_a_window_is_wanted_no_longer_once_one_was_accepted_or_the_monitor_is_clear() -> None:
-    knocked = solved(OBJECTED, moved_within(0.5, 3.0))
-    assert urgent_window_since(solved(knocked, estimate(0.5, 400))) is None
-    assert urgent_window_since(watched(knocked, *clear_from(310, 3))) is None
+def test_a_window_is_requested_no_longer_once_one_was_accepted_or_the_monitor_is_clear() -> None:
+    displaced = solved(OBJECTED, moved_within(0.5, 3.0))
+    assert urgent_window_since(solved(displaced, estimate(0.5, 400))) is None
+    assert urgent_window_since(watched(displaced, *clear_from(310, 3))) is None
 
 
-def test_the_monitor_says_since_when_a_window_is_wanted() -> None:
+def test_the_monitor_reports_since_when_a_window_is_requested() -> None:
     state = watched(HEALTHY, *clear_from(200, 2), *flagged_from(300, 6))
     assert state.flagged_since_ns is not None
     assert urgent_window_since(state) == state.flagged_since_ns
@@ -348,7 +348,7 @@ def test_doubt_begins_with_a_check_that_is_undecided_and_ends_with_one_that_is_c
     assert watched(doubted, *clear_from(205, 1)).flagged_since_ns is None
 
 
-def test_a_window_elsewhere_and_a_monitor_that_suspects_are_two_witnesses() -> None:
+def test_a_window_elsewhere_and_a_monitor_that_suspects_are_two_cues() -> None:
     suspect = watched(HEALTHY, *clear_from(110, 2), *flagged_from(120, 2))
     assert suspect.health is HealthState.SUSPECT
     begin_ns = suspect.flagged_since_ns
@@ -484,7 +484,7 @@ def test_a_reset_serves_nominal_and_knows_nothing() -> None:
     assert watched(state, *clear_from(300, 5)).health is HealthState.UNKNOWN
 
 
-def test_a_roll_back_is_looked_at_before_it_is_called_healthy() -> None:
+def test_a_roll_back_is_checked_before_it_is_called_healthy() -> None:
     state = rolled_back(HEALTHY, pose_of(estimate(0.2)), estimate(0.2), RULES)
     np.testing.assert_array_equal(state.T_camera_lidar, pose_of(estimate(0.2)))
     assert (state.provenance, state.health) == (Provenance.RESTORED, HealthState.UNKNOWN)
@@ -501,7 +501,7 @@ def test_commissioning_confirms_what_is_served_and_nothing_else() -> None:
 
 
 @pytest.mark.fault("silence", "nothing stays healthy that was not looked at")
-def test_what_was_not_looked_at_for_long_is_stale_not_healthy() -> None:
+def test_what_was_not_checked_for_long_is_stale_not_healthy() -> None:
     assert aged(HEALTHY, DAY_S, DAY_S) is HEALTHY
     state = aged(HEALTHY, DAY_S + 1.0, DAY_S)
     assert (state.health, [reason.code for reason in state.reasons]) == (HealthState.STALE, ["stale", "last_known"])
@@ -516,7 +516,7 @@ def test_what_was_not_looked_at_for_long_is_stale_not_healthy() -> None:
 WORKER = Reason("overdue_worker", "No check has been completed for 16 s: the worker has not answered.")
 
 
-def test_without_a_completed_check_green_turns_yellow_and_what_was_known_is_said() -> None:
+def test_without_a_completed_check_green_turns_yellow_and_what_was_known_is_reported() -> None:
     state = overdue(HEALTHY, WORKER)
     assert state.health is HealthState.DEGRADED
     assert [reason.code for reason in state.reasons] == ["overdue_worker", "last_known"]
@@ -534,7 +534,7 @@ def test_without_a_completed_check_green_turns_yellow_and_what_was_known_is_said
 def anything(rng: np.random.Generator, stamp_s: int) -> Callable[[PairState], PairState]:
     """Something that happens to a pair at this time."""
     turned_deg = float(rng.choice([0.5, 0.6, 3.0]))
-    ways: list[Callable[[PairState], PairState]] = [
+    directions: list[Callable[[PairState], PairState]] = [
         lambda state: watched(state, check(stamp_s)),
         lambda state: watched(state, *flagged_from(stamp_s, 3)),
         lambda state: watched(state, *(check(stamp_s + i, flagged=True, cause="dark") for i in range(3))),
@@ -543,7 +543,7 @@ def anything(rng: np.random.Generator, stamp_s: int) -> Callable[[PairState], Pa
         lambda state: time_stepped_back(state, stamp_s * S),
         restored,
     ]
-    return ways[rng.choice(len(ways), p=[0.4, 0.15, 0.1, 0.15, 0.1, 0.05, 0.05])]
+    return directions[rng.choice(len(directions), p=[0.4, 0.15, 0.1, 0.15, 0.1, 0.05, 0.05])]
 
 
 @pytest.mark.fault("checks that are overdue because the machine is busy", "they are reported, and change no decision")
@@ -551,7 +551,7 @@ def anything(rng: np.random.Generator, stamp_s: int) -> Callable[[PairState], Pa
 def test_what_the_data_decide_does_not_hang_on_how_long_the_machine_took(seed: int) -> None:
     rng, busy_rng = np.random.default_rng(seed), np.random.default_rng(seed + 1000)
     prompt = busy = initial_state(RIG)
-    told: set[HealthState] = set()
+    reported: set[HealthState] = set()
     for stamp_s in range(300, 1200, 20):
         happens = anything(rng, stamp_s)
         prompt, busy = happens(prompt), happens(busy)
@@ -563,11 +563,11 @@ def test_what_the_data_decide_does_not_hang_on_how_long_the_machine_took(seed: i
             busy = overdue(busy, WORKER)
         if busy_rng.random() < 0.2:
             busy = aged(busy, DAY_S + 1.0, DAY_S)
-        told.add(busy.health)
-    assert told & {HealthState.DEGRADED, HealthState.STALE}
+        reported.add(busy.health)
+    assert reported & {HealthState.DEGRADED, HealthState.STALE}
 
 
-def test_a_check_that_changes_nothing_ends_what_was_said_of_its_delay() -> None:
+def test_a_check_that_changes_nothing_ends_what_was_reported_of_its_delay() -> None:
     suspect = replace(HEALTHY, health=HealthState.SUSPECT, reasons=(KNOCK,), proven=False)
     late = aged(suspect, DAY_S + 1.0, DAY_S)
     assert late.health is HealthState.STALE
@@ -587,7 +587,7 @@ def test_sensor_time_that_steps_back_leaves_nothing_green_and_no_suspicion_out_o
     assert solved(again, elsewhere).health is HealthState.HEALTHY, "a window of the new time decides"
 
 
-def test_an_estimate_read_back_from_disk_says_so_and_has_not_been_looked_at() -> None:
+def test_an_estimate_read_back_from_disk_is_reported_and_has_not_been_checked() -> None:
     state = restored(HEALTHY)
     assert (state.provenance, state.health) == (Provenance.RESTORED, HealthState.UNKNOWN)
     assert [reason.code for reason in state.reasons] == ["restarted", "last_known"]

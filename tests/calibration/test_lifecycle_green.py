@@ -56,8 +56,8 @@ class World:
     @property
     def report(self) -> StreamStatistics:
         many = StreamCounts(10 * self.now_s, 10 * self.now_s)
-        chosen = SelectionStatistics(checks=self.now_s, last_ns=self.now_s * S)
-        return StreamStatistics(streams={CAMERA: many, LIDAR: many}, pairs=self.now_s, selection=chosen, pace=1.0)
+        selected = SelectionStatistics(checks=self.now_s, last_ns=self.now_s * S)
+        return StreamStatistics(streams={CAMERA: many, LIDAR: many}, pairs=self.now_s, selection=selected, pace=1.0)
 
     def step(self, what: str, after: PairState, completed_s: int | None = None) -> None:
         """Takes a step as the service does: progress, and then a look at the clocks. `completed_s`: sensor time of the
@@ -69,9 +69,9 @@ class World:
         if completed_s is not None:
             acquits = after.monitor.acquitted_ns == completed_s * S
             self.progress.completed(completed_s * S, self.steady_s, self.report, acquits=acquits)
-        self.look()
+        self.inspection()
 
-    def look(self) -> None:
+    def inspection(self) -> None:
         """What the service does once a second."""
         why = self.progress.overdue(self.report, self.steady_s, at_rest=holds_at_rest(self.state.monitor))
         if why is not None:
@@ -80,7 +80,7 @@ class World:
     def passes(self, seconds: int) -> None:
         self.now_s += seconds
         self.steady_s += seconds
-        self.look()
+        self.inspection()
 
     # --- what may happen --------------------------------------------------------------------------------------------
 
@@ -131,7 +131,7 @@ class World:
     def commanded(self) -> None:
         name = str(self.rng.choice(["apply", "roll back", "reset", "hold", "release", "commission"]))
         state = self.state
-        ways: dict[str, Callable[[], PairState]] = {
+        directions: dict[str, Callable[[], PairState]] = {
             "apply": lambda: lifecycle.apply_pending(state, RULES),
             "roll back": lambda: lifecycle.rolled_back(
                 state, estimate(2.0).optimum.T_camera_lidar, estimate(2.0), RULES
@@ -142,7 +142,7 @@ class World:
             "commission": lambda: lifecycle.after_commissioning(state, state.T_camera_lidar),
         }
         try:
-            after = ways[name]()
+            after = directions[name]()
         except lifecycle.CommandRefusedError:
             return
         if name in ("apply", "roll back", "reset"):
@@ -164,8 +164,8 @@ class World:
         self.passes(int(self.rng.integers(1, 40)))
 
     def anything(self) -> None:
-        ways = (self.checked, self.solved, self.commanded, self.restarted, self.clock_stepped, self.silent)
-        ways[self.rng.choice(len(ways), p=[0.62, 0.14, 0.08, 0.03, 0.03, 0.10])]()
+        directions = (self.checked, self.solved, self.commanded, self.restarted, self.clock_stepped, self.silent)
+        directions[self.rng.choice(len(directions), p=[0.62, 0.14, 0.08, 0.03, 0.03, 0.10])]()
 
     def holds(self) -> bool:
         """Whether the rule for green holds."""

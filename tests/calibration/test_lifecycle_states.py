@@ -48,8 +48,8 @@ def test_the_table_is_total_and_every_event_has_a_meaning() -> None:
 
 
 def test_green_is_only_reached_by_looking() -> None:
-    ways = {event for (before, event), after in TRANSITIONS.items() if after is H and before is not H}
-    assert ways == {HealthEvent.CONFIRMED_BY_WINDOW, HealthEvent.CLEAR}
+    directions = {event for (before, event), after in TRANSITIONS.items() if after is H and before is not H}
+    assert directions == {HealthEvent.CONFIRMED_BY_WINDOW, HealthEvent.CLEAR}
 
 
 def test_silence_and_bad_data_hide_no_red() -> None:
@@ -58,7 +58,7 @@ def test_silence_and_bad_data_hide_no_red() -> None:
         assert TRANSITIONS[M, event] is M
 
 
-def test_whoever_has_not_looked_is_not_green() -> None:
+def test_whoever_has_not_checked_is_not_green() -> None:
     for event in (
         HealthEvent.OVERDUE,
         HealthEvent.AGED,
@@ -70,8 +70,8 @@ def test_whoever_has_not_looked_is_not_green() -> None:
 
 
 def test_only_a_moved_mount_is_red() -> None:
-    ways = {event for (before, event), after in TRANSITIONS.items() if after is M and before is not M}
-    assert ways == {HealthEvent.CONTRADICTED, HealthEvent.MOUNT_MOVED}
+    directions = {event for (before, event), after in TRANSITIONS.items() if after is M and before is not M}
+    assert directions == {HealthEvent.CONTRADICTED, HealthEvent.MOUNT_MOVED}
 
 
 def test_every_state_can_be_reached_and_left() -> None:

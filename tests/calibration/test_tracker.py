@@ -58,7 +58,7 @@ def yaw(angle_deg: float) -> Array:
     return np.array([0.0, radians(angle_deg), 0.0, 0.0, 0.0, 0.0])
 
 
-def drawn(rng: np.random.Generator, count: int, sigma: Array = SIGMA) -> list[Measurement]:
+def samples(rng: np.random.Generator, count: int, sigma: Array = SIGMA) -> list[Measurement]:
     return [about(TRUTH, rng.normal(0.0, SIGMA), sigma, k * PERIOD_NS) for k in range(count)]
 
 
@@ -75,7 +75,7 @@ def error(track: Track) -> Array:
 # -------------------------------------------------------------------------------------------------- the slow track
 @pytest.mark.parametrize("count", [1, 4, 25])
 def test_variance_falls_with_the_number_of_windows(count: int, rng: np.random.Generator) -> None:
-    track = after(track_at(TRUTH), drawn(rng, count))
+    track = after(track_at(TRUTH), samples(rng, count))
     information = count / SIGMA**2 + 1.0 / prior_sigma(STILL) ** 2
     np.testing.assert_allclose(np.sqrt(track.covariance.diagonal()), 1.0 / np.sqrt(information), rtol=1e-3)
     assert track.windows == count
@@ -95,7 +95,7 @@ def test_a_window_that_counts_double_is_two_windows(rng: np.random.Generator) ->
 
 
 def test_without_creep_the_order_does_not_matter(rng: np.random.Generator) -> None:
-    windows = drawn(rng, 4)
+    windows = samples(rng, 4)
     tracks = [after(track_at(TRUTH), list(order)) for order in permutations(windows)]
     for track in tracks[1:]:
         assert np.abs(se3.difference(track.T_camera_lidar, tracks[0].T_camera_lidar)).max() < 0.01 * SIGMA.min()
@@ -105,14 +105,14 @@ def test_without_creep_the_order_does_not_matter(rng: np.random.Generator) -> No
 def test_moving_the_lidar_frame_moves_the_track_with_it(rng: np.random.Generator) -> None:
     """The perturbation is about the camera: another LiDAR frame on the right changes nothing else."""
     T_lidar_other = se3.exp(rng.normal(size=6))
-    windows = drawn(rng, 5)
+    windows = samples(rng, 5)
     moved = [replace(w, T_camera_lidar=w.T_camera_lidar @ T_lidar_other) for w in windows]
     here, there = after(track_at(TRUTH), windows), after(track_at(TRUTH @ T_lidar_other), moved)
     np.testing.assert_allclose(here.T_camera_lidar @ T_lidar_other, there.T_camera_lidar, atol=1e-9)
     np.testing.assert_allclose(here.covariance, there.covariance, rtol=1e-9, atol=1e-18)
 
 
-def test_axes_that_no_window_tells_keep_their_prior(rng: np.random.Generator) -> None:
+def test_axes_that_no_window_determines_keep_their_prior(rng: np.random.Generator) -> None:
     start = se3.perturb(TRUTH, np.array([0.01, 0.0, 0.0, 0.0, 0.0, 0.0]))
     windows = [about(TRUTH, np.where(np.arange(6) < 3, rng.normal(0.0, SIGMA), 9.0), ROTATION_ONLY) for _ in range(6)]
     track = after(track_at(start), windows)
@@ -129,12 +129,12 @@ def test_correlated_axes_inform_each_other() -> None:
     covariance[0, 4] = covariance[4, 0] = 0.9 * SIGMA[0] * SIGMA[4]
     track = after(track_at(TRUTH), [Measurement(TRUTH, noise_alone(covariance), 0)])
     height_only = np.where(np.arange(6) == 4, 1e-4, np.nan)
-    told = after(track, [about(TRUTH, np.array([0.0, 0.0, 0.0, 0.0, 0.01, 0.0]), height_only)])
-    assert error(told)[0] == pytest.approx(0.9 * SIGMA[0] / SIGMA[4] * 0.01, rel=0.05)
-    assert sqrt(told.covariance[0, 0]) == pytest.approx(sqrt(1.0 - 0.81) * SIGMA[0], rel=0.05)
+    reported = after(track, [about(TRUTH, np.array([0.0, 0.0, 0.0, 0.0, 0.01, 0.0]), height_only)])
+    assert error(reported)[0] == pytest.approx(0.9 * SIGMA[0] / SIGMA[4] * 0.01, rel=0.05)
+    assert sqrt(reported.covariance[0, 0]) == pytest.approx(sqrt(1.0 - 0.81) * SIGMA[0], rel=0.05)
 
 
-def test_a_window_that_tells_nothing_changes_nothing() -> None:
+def test_a_window_that_is_uninformative_changes_nothing() -> None:
     track = track_at(TRUTH)
     assert update_track(track, about(TRUTH, yaw(1.0), np.full(6, np.nan)), STILL) is track
 
@@ -160,8 +160,8 @@ def sharing(measurement: Measurement, systematic: dict[str, Array] = SHARED) -> 
 
 
 def test_noise_averages_away_and_what_windows_have_in_common_does_not(rng: np.random.Generator) -> None:
-    alone = after(track_at(TRUTH), drawn(rng, 200))
-    track = after(track_at(TRUTH), [sharing(window) for window in drawn(rng, 200)])
+    alone = after(track_at(TRUTH), samples(rng, 200))
+    track = after(track_at(TRUTH), [sharing(window) for window in samples(rng, 200)])
     np.testing.assert_allclose(track.covariance, alone.covariance, rtol=1e-9)
     assert np.sqrt(track.covariance.diagonal())[1] < 0.1 * SIGMA[1]
     expected = np.sqrt(track.covariance.diagonal() + SHARED["lens"] ** 2 + SHARED["stamps"] ** 2)
@@ -178,7 +178,7 @@ def test_the_same_cause_in_opposite_directions_cancels() -> None:
 def test_a_scene_that_pulls_elsewhere_is_no_step(rng: np.random.Generator) -> None:
     """Another scene, another tenth of a degree: within what windows of one scene share, that is not a bent mount."""
     window = about(TRUTH, yaw(0.3))
-    track = after(track_at(TRUTH), drawn(rng, 200))
+    track = after(track_at(TRUTH), samples(rng, 200))
     assert update_track(track, window, STILL).step is StepState.SUSPECTED
     assert update_track(track, sharing(window, {"edges": yaw(0.1)}), STILL).step is StepState.NONE
 
@@ -188,14 +188,14 @@ def test_three_sigma_covers() -> None:
     rng = np.random.default_rng(11)
     covered = np.zeros(6)
     for _ in range(300):
-        track = after(track_at(TRUTH), drawn(rng, 8))
+        track = after(track_at(TRUTH), samples(rng, 8))
         covered += np.abs(error(track)) <= 3.0 * track.uncertainty.sigma
     assert (covered >= 0.99 * 300).all()
 
 
 # -------------------------------------------------------------------------------------------------- the fast track
 def test_a_step_is_noticed_by_the_first_window_and_taken_at_the_second(rng: np.random.Generator) -> None:
-    track = after(track_at(TRUTH), drawn(rng, 20))
+    track = after(track_at(TRUTH), samples(rng, 20))
     before = track.T_camera_lidar
     first, second = (about(TRUTH, yaw(1.0) + rng.normal(0.0, SIGMA)) for _ in range(2))
     track = update_track(track, first, STILL)
@@ -213,7 +213,7 @@ def test_a_step_is_noticed_by_the_first_window_and_taken_at_the_second(rng: np.r
 
 @pytest.mark.fault("a single wrong window", "what is served does not move")
 def test_one_outlier_does_not_move_the_track(rng: np.random.Generator) -> None:
-    windows = drawn(rng, 12)
+    windows = samples(rng, 12)
     outlier = about(TRUTH, np.array([0.3, -0.2, 0.1, 0.4, 0.0, 0.0]), SIGMA, 5 * PERIOD_NS)
     clean, hit = after(track_at(TRUTH), windows), after(track_at(TRUTH), [*windows[:6], outlier, *windows[6:]])
     np.testing.assert_array_equal(hit.T_camera_lidar, clean.T_camera_lidar)
@@ -222,14 +222,14 @@ def test_one_outlier_does_not_move_the_track(rng: np.random.Generator) -> None:
 
 
 def test_two_outliers_that_disagree_confirm_nothing(rng: np.random.Generator) -> None:
-    track = after(track_at(TRUTH), drawn(rng, 6))
+    track = after(track_at(TRUTH), samples(rng, 6))
     wrong = after(track, [about(TRUTH, yaw(2.0)), about(TRUTH, yaw(-2.0))])
     assert wrong.step is StepState.SUSPECTED
     np.testing.assert_array_equal(wrong.T_camera_lidar, track.T_camera_lidar)
 
 
 def test_after_a_step_of_the_rotation_the_translation_is_as_uncertain_as_at_first(rng: np.random.Generator) -> None:
-    track = after(track_at(TRUTH), drawn(rng, 10))
+    track = after(track_at(TRUTH), samples(rng, 10))
     bent = after(track, [about(TRUTH, yaw(3.0), ROTATION_ONLY)] * 2)
     assert bent.step is StepState.CONFIRMED
     np.testing.assert_allclose(np.sqrt(bent.covariance.diagonal())[3:], prior_sigma(STILL)[3:])
@@ -238,7 +238,7 @@ def test_after_a_step_of_the_rotation_the_translation_is_as_uncertain_as_at_firs
 
 def test_an_overwhelming_window_is_taken_alone_only_where_that_is_allowed(rng: np.random.Generator) -> None:
     bold = STILL.model_copy(update={"overwhelming_false_alarm": 1e-30})
-    track = after(track_at(TRUTH), drawn(rng, 10))
+    track = after(track_at(TRUTH), samples(rng, 10))
     window = about(TRUTH, yaw(5.0))
     assert update_track(track, window, STILL).step is StepState.SUSPECTED
     taken = update_track(track, window, bold)
@@ -246,12 +246,12 @@ def test_an_overwhelming_window_is_taken_alone_only_where_that_is_allowed(rng: n
     np.testing.assert_allclose(taken.T_camera_lidar, window.T_camera_lidar, atol=1e-12)
 
 
-def test_false_alarms_are_as_rare_as_asked_for() -> None:
+def test_false_alarms_are_as_rare_as_requested() -> None:
     """The distance is chi-square distributed: at a limit of a hundredth, a hundredth."""
     config = STILL.model_copy(update={"step_false_alarm": 0.01})
     rng = np.random.default_rng(5)
-    track = after(track_at(TRUTH), drawn(rng, 20), config)
-    alarms = sum(update_track(track, w, config).step is StepState.SUSPECTED for w in drawn(rng, 3000))
+    track = after(track_at(TRUTH), samples(rng, 20), config)
+    alarms = sum(update_track(track, w, config).step is StepState.SUSPECTED for w in samples(rng, 3000))
     assert alarms == pytest.approx(30, abs=4 * sqrt(30))
 
 
@@ -275,7 +275,7 @@ def test_chi_square_tail_at_five_percent(x: float, k: int) -> None:
 
 
 def test_a_restart_gives_the_same_bytes(rng: np.random.Generator) -> None:
-    windows = [*drawn(rng, 5), about(TRUTH, yaw(1.0)), about(TRUTH, yaw(1.01)), *drawn(rng, 2)]
+    windows = [*samples(rng, 5), about(TRUTH, yaw(1.0)), about(TRUTH, yaw(1.01)), *samples(rng, 2)]
     config = TrackerConfig()
     through = track_at(TRUTH)
     restarted = through
@@ -309,10 +309,10 @@ def test_a_track_starts_at_a_rigid_pose_with_a_spread(pose: Array, sigma: Array)
 # ------------------------------------------------------------------------------------------------------- a drift
 def test_a_drift_is_followed_while_the_monitor_doubts_and_averaged_away_otherwise() -> None:
     settled = after(track_at(TRUTH), [about(TRUTH, np.zeros(6), SIGMA, k * PERIOD_NS) for k in range(5)])
-    aside = about(TRUTH, yaw(0.18), SIGMA, 5 * PERIOD_NS)
-    assert update_track(settled, aside, STILL).step is StepState.NONE
+    offset = about(TRUTH, yaw(0.18), SIGMA, 5 * PERIOD_NS)
+    assert update_track(settled, offset, STILL).step is StepState.NONE
     calm, doubted = (
-        degrees(error(update_track(settled, aside, STILL, doubted=doubted))[1]) for doubted in (False, True)
+        degrees(error(update_track(settled, offset, STILL, doubted=doubted))[1]) for doubted in (False, True)
     )
     assert calm < 0.04
     assert 0.09 < doubted < 0.18

@@ -56,9 +56,9 @@ def verdict_on(
     stop: StopReason = StopReason.TOLERANCE,
     of_objective: tuple[Metric, ...] = OUTSTANDING,
     sigma: NDArray[np.float64] = SHARP,
-    looks: float = float(FRAMES),
+    observations: float = float(FRAMES),
 ) -> Verdict:
-    return judge((*of_objective, *shape_metrics(evaluation, curvature, sigma, LIMITS)), stop, looks, FRAMES)
+    return judge((*of_objective, *shape_metrics(evaluation, curvature, sigma, LIMITS)), stop, observations, FRAMES)
 
 
 def test_a_peak_with_everything_in_view_is_accepted() -> None:
@@ -78,7 +78,7 @@ def test_a_peak_with_everything_in_view_is_accepted() -> None:
         (verdict_on(stop=StopReason.AT_BOUND), "optimum_at_bound"),
         (verdict_on(stop=StopReason.EVALUATIONS), "evaluations_exhausted"),
         (verdict_on(sigma=VAGUE), "sigma_deg"),
-        (verdict_on(sigma=UNKNOWN, looks=np.nan), "sigma_deg"),
+        (verdict_on(sigma=UNKNOWN, observations=np.nan), "sigma_deg"),
         (verdict_on(of_objective=(replace(OUTSTANDING[0], value=3.0),)), "edge_contrast"),
         (verdict_on(of_objective=(replace(OUTSTANDING[1], value=0.95),)), "runner_up"),
         (verdict_on(of_objective=(Metric("mi_over_unrelated", 1.1, 1.2, at_least=True),)), "mi_over_unrelated"),
@@ -128,16 +128,16 @@ def test_peakedness_is_the_curvature_over_the_score() -> None:
 
 
 def test_a_window_that_is_too_uncertain_because_it_saw_one_scene_needs_motion() -> None:
-    assert [reason.code for reason in verdict_on(sigma=VAGUE, looks=2.0).reasons] == ["sigma_deg", "motion"]
-    assert [reason.code for reason in verdict_on(sigma=VAGUE, looks=9.0).reasons] == ["sigma_deg"]
-    assert verdict_on(looks=2.0).decision is Decision.ACCEPTED
+    assert [reason.code for reason in verdict_on(sigma=VAGUE, observations=2.0).reasons] == ["sigma_deg", "motion"]
+    assert [reason.code for reason in verdict_on(sigma=VAGUE, observations=9.0).reasons] == ["sigma_deg"]
+    assert verdict_on(observations=2.0).decision is Decision.ACCEPTED
 
 
 def test_range_edges_that_frames_have_in_common_count_once() -> None:
-    found = (Metric("range_edges", 3000.0, 1000.0, at_least=True), OUTSTANDING[0])
-    once = {metric.name: metric.value for metric in counted_once(found, 2.0, FRAMES)}
+    result = (Metric("range_edges", 3000.0, 1000.0, at_least=True), OUTSTANDING[0])
+    once = {metric.name: metric.value for metric in counted_once(result, 2.0, FRAMES)}
     assert once == {"range_edges": 600.0, "edge_contrast": OUTSTANDING[0].value}
-    assert counted_once(found, float("nan"), FRAMES) == found
+    assert counted_once(result, float("nan"), FRAMES) == result
 
 
 def at_speed(street: Window, speed_mps: float | None) -> list[FramePair]:
@@ -202,22 +202,22 @@ def test_what_is_no_knock_does_not_refuse(change: ChangePoint | None) -> None:
     assert verdict_after(change).decision is Decision.ACCEPTED
 
 
-def loosened(name: str, certainty: float, moved_px: float) -> RelaxedAssumption:
+def relaxed(name: str, certainty: float, moved_px: float) -> RelaxedAssumption:
     return RelaxedAssumption(name, certainty, moved_px, np.zeros(12), np.zeros(6), believed=1.0)
 
 
 @pytest.mark.parametrize(
-    ("found", "refused"),
+    ("result", "refused"),
     [
-        (loosened(LENS_FREE, 3.0, 1.0), True),
-        (loosened(LENS_FREE, 3.0, 0.1), False),
-        (loosened(LENS_FREE, 1.0, 1.0), False),
-        (loosened(CLOCKS_FREE, 3.0, 1.0), False),
+        (relaxed(LENS_FREE, 3.0, 1.0), True),
+        (relaxed(LENS_FREE, 3.0, 0.1), False),
+        (relaxed(LENS_FREE, 1.0, 1.0), False),
+        (relaxed(CLOCKS_FREE, 3.0, 1.0), False),
     ],
     ids=["another lens", "one that hardly matters", "one that is not certain", "other clocks"],
 )
-def test_a_window_through_another_lens_is_refused_for_that(found: RelaxedAssumption, refused: bool) -> None:
-    verdict = verdict_on(of_objective=(*OUTSTANDING, *intrinsics_metric([found], LIMITS)))
+def test_a_window_through_another_lens_is_refused_for_that(result: RelaxedAssumption, refused: bool) -> None:
+    verdict = verdict_on(of_objective=(*OUTSTANDING, *intrinsics_metric([result], LIMITS)))
     assert [reason.code for reason in verdict.reasons] == ([INTRINSICS_OFF] if refused else [])
     assert verdict.shows_another_lens is refused
     if refused:

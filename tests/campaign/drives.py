@@ -34,15 +34,15 @@ class Drive:
     seed: int
     seconds: int
     faults: tuple[str, ...] = ()
-    words: tuple[tuple[str, str], ...] = ()
+    text: tuple[tuple[str, str], ...] = ()
 
     @property
     def source(self) -> str:
         """The same drive as a SOURCE: for the rig and its mask, which a bag has no place for."""
-        words = (*self.words, *((("faults", ";".join(self.faults)),) if self.faults else ()))
+        text = (*self.text, *((("faults", ";".join(self.faults)),) if self.faults else ()))
         return (
             f"sim:seed={self.seed}&seconds={self.seconds}&camera={CAMERA}&lidar={LIDAR}"
-            f"&camera_hz={RATE_HZ}&lidar_hz={RATE_HZ}" + "".join(f"&{key}={value}" for key, value in words)
+            f"&camera_hz={RATE_HZ}&lidar_hz={RATE_HZ}" + "".join(f"&{key}={value}" for key, value in text)
         )
 
     def recorded(self, folder: Path) -> Path:
@@ -52,7 +52,7 @@ class Drive:
         path = cache / f"drive-{self.seed}-{name}.mcap"
         if not path.exists():
             faults = [word for fault in self.faults for word in ("--fault", fault)]
-            faults += [word for key, value in self.words for word in (OPTIONS[key], value)]
+            faults += [word for key, value in self.text for word in (OPTIONS[key], value)]
             sizes = ("--camera", CAMERA, "--lidar", LIDAR, "--camera-hz", RATE_HZ, "--lidar-hz", RATE_HZ)
             done = coec("sim", "drive", "--output", path, "--seed", self.seed, "--seconds", self.seconds, *sizes,
                         *faults, timeout_s=RENDER_S)  # fmt: skip
@@ -65,8 +65,8 @@ class Truth:
 
     def __init__(self, path: Path) -> None:
         with AnyReader([path]) as reader:
-            chosen = [connection for connection in reader.connections if connection.topic == TRUTH_TOPIC]
-            messages = [reader.deserialize(data, of.msgtype) for of, _, data in reader.messages(chosen)]
+            selected = [connection for connection in reader.connections if connection.topic == TRUTH_TOPIC]
+            messages = [reader.deserialize(data, of.msgtype) for of, _, data in reader.messages(selected)]
         transforms = [message.transforms[0] for message in messages]  # type: ignore[attr-defined]  # a TFMessage
         poses = [one for one in transforms if one.header.frame_id == "camera"]
         turns = [one.transform.rotation for one in poses]

@@ -41,7 +41,7 @@ WRONG_DEG = 0.5
 POLL_S = 0.2
 ANSWER_S = 10.0
 MIB = 2**20
-ENDED_S = 15.0
+FINISHED_S = 15.0
 
 
 def configured(folder: Path, drive: Drive) -> Path:
@@ -63,7 +63,7 @@ def configured(folder: Path, drive: Drive) -> Path:
     return path
 
 
-class ServiceEndedError(Exception):
+class ServiceFinishedError(Exception):
     """The service is gone, although nobody told it to go."""
 
 
@@ -130,28 +130,28 @@ class Watch:
         """The latest sample."""
         return self.samples[-1]
 
-    def heard(self, sample: zenoh.Sample) -> None:
+    def received(self, sample: zenoh.Sample) -> None:
         """Of the ego-motion on the air: the client's own clock of the sensors."""
         self._stamp_ns = decode_ego(sample.payload.to_bytes(), LimitsConfig()).stamp_ns
 
-    def ask(self, key: str) -> Any:
+    def query(self, key: str) -> Any:
         """The document behind a key."""
         return json.loads(query_one(self.session, f"{key}?format=json", ANSWER_S).payload)
 
-    def look(self) -> Sample:
+    def observation(self) -> Sample:
         """One more sample.
 
         Raises:
             ServiceEndedError: nobody answers any more, because the service is gone.
         """
         try:
-            health, extrinsic = self.ask(self.keys.health(self.pair)), self.ask(self.keys.extrinsic(self.pair))
-            status = self.ask(self.keys.status)
+            health, extrinsic = self.query(self.keys.health(self.pair)), self.query(self.keys.extrinsic(self.pair))
+            status = self.query(self.keys.status)
         except CoecError as error:
             # A process that closes its session answers nothing for a while before it is gone.
             with suppress(subprocess.TimeoutExpired):
-                code = self.running.process.wait(ENDED_S)
-                raise ServiceEndedError(f"the service has ended with {code}: {self.errors_logged()[-3:]}") from error
+                code = self.running.process.wait(FINISHED_S)
+                raise ServiceFinishedError(f"the service has ended with {code}: {self.errors_logged()[-3:]}") from error
             raise
         pair, worker = status["pairs"][0], status["worker"]
         served = np.array(extrinsic["camera_from_lidar"]["matrix"])
@@ -181,7 +181,7 @@ class Watch:
         while time.monotonic() < end_s:
             time.sleep(max(self._next_s - time.monotonic(), 0.0))
             self._next_s = time.monotonic() + POLL_S
-            if condition(self.look()):
+            if condition(self.observation()):
                 return True
         return False
 
@@ -214,15 +214,15 @@ class Watch:
         """Ends the player."""
         if self._player is not None and self._player.poll() is None:
             self._player.terminate()
-            self._player.wait(ENDED_S)
+            self._player.wait(FINISHED_S)
 
     def errors_logged(self) -> list[str]:
         """Messages of the service's log at level error or above."""
-        found = []
+        result = []
         for line in self.running.log.read_text().splitlines():
             if line.startswith("{") and (entry := json.loads(line)).get("level") in ("error", "critical"):
-                found.append(str(entry.get("message", entry)))
-        return found
+                result.append(str(entry.get("message", entry)))
+        return result
 
 
 @contextmanager
@@ -237,7 +237,7 @@ def watching(
         watch = Watch(running, running.session, running.config, path, truth)
         ego = running.config.pairs[0].ego
         assert ego is not None
-        subscriber = running.session.declare_subscriber(ego.place, watch.heard)
+        subscriber = running.session.declare_subscriber(ego.place, watch.received)
         try:
             yield watch
         finally:

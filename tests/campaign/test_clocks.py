@@ -42,7 +42,7 @@ STALE_AFTER_S = 86_400.0
 REST_S = 8.0
 MEMORY_MIB = 20.0
 UNCHECKED, MORE_MEMORY = "`healthy` without a completed check", "memory more than before"
-SAID = ("unknown", "degraded")
+REPORTED = ("unknown", "degraded")
 STEPPING_CLOCK = Path(stepping_clock.__file__)
 CLOCKS = {"-400 days": -400 * DAY_S, "+1 h": HOUR_S, "+100 days": 100 * DAY_S}
 
@@ -64,21 +64,21 @@ def after_a_jump(what: str, samples: Sequence[Sample], begin_s: float) -> list[F
     before = [sample for sample in samples if sample.wall_s < begin_s]
     later = samples[len(before) :]
     seconds = {id(sample): (sample.wall_s - begin_s) * rate() for sample in later}
-    said = [seconds[id(sample)] for sample in later if sample.state in SAID and sample.reasons]
+    reported = [seconds[id(sample)] for sample in later if sample.state in REPORTED and sample.reasons]
     checked = [seconds[id(sample)] for sample in later if sample.checks > later[0].checks]
     held = max(max(sample.held for sample in before), min(sample.held for sample in later))
     most_before = max(sample.rss_bytes for sample in before)
     most = max(sample.rss_bytes for sample in later if sample.held <= held)
     quiet = longest_unchecked(later, rate())
-    first = f"after {said[0]:.3g} s" if said else "never"
-    kept_up = bool(checked) and checked[0] <= 3 * PERIOD_S
+    first = f"after {reported[0]:.3g} s" if reported else "never"
+    retained_up = bool(checked) and checked[0] <= 3 * PERIOD_S
     return [
         # Who goes on looking within three periods has nothing to be unknown about.
         Figure(
             f"{what}: unknown or degraded with its reason, unless it goes on looking",
             f"≤ {3 * PERIOD_S:g} s",
             f"{first}; next check {f'after {checked[0]:.3g} s' if checked else 'never'}",
-            kept_up or bool(said and said[0] <= 3 * PERIOD_S),
+            retained_up or bool(reported and reported[0] <= 3 * PERIOD_S),
         ),
         at_most(f"{what}: {UNCHECKED}", 3 * PERIOD_S + 1.0, quiet, "s"),
         exactly(f"{what}: healthy at the end", "healthy", later[-1].state),
@@ -114,15 +114,15 @@ def test_stamps_that_jump(tmp_path: Path, record_property: Callable[[str, object
     def played_again(watch: Watch) -> None:
         for number in (2, 3):
             first = watch.play_through(recording, rate(), PATIENCE_S)
-            told(f"played again ({number})", watch, first)
+            report(f"played again ({number})", watch, first)
 
     def an_hour_ahead(watch: Watch) -> None:
         first = watch.play_through(ahead, rate(), PATIENCE_S)
-        told("a minute an hour ahead", watch, first)
+        report("a minute an hour ahead", watch, first)
         first = watch.play_through(later, rate(), PATIENCE_S)
-        told("back from an hour ahead", watch, first)
+        report("back from an hour ahead", watch, first)
 
-    def told(what: str, watch: Watch, first: int) -> None:
+    def report(what: str, watch: Watch, first: int) -> None:
         samples = watch.samples[first:]
         begin_s = next((one.wall_s for one in samples if one.stamp_ns != samples[0].stamp_ns), samples[0].wall_s)
         figures.extend(after_a_jump(what, watch.samples, begin_s))
@@ -161,8 +161,8 @@ def test_a_state_and_windows_of_another_time(tmp_path: Path, record_property: Ca
     with watching(path, truth) as watch:
         watch.passing(REST_S)
     state = folder / "state" / "state.json"
-    kept = StateFile(state).load().body
-    assert kept is not None
+    retained = StateFile(state).load().body
+    assert retained is not None
     times = {one: one.stat().st_mtime for one in (folder / "state" / "windows").glob("*.mcap")}
     assert times
 
@@ -170,13 +170,13 @@ def test_a_state_and_windows_of_another_time(tmp_path: Path, record_property: Ca
         # The drive goes on after the one before: only the wall clock jumps here.
         onward = part(recording, 0.0, DRIVE.seconds, 200.0 * (number + 1), tmp_path / f"onward{number}.mcap")
         # The clock moved by so much: what was written before lies as far the other way.
-        _moved(state, kept, -moved_s)
+        _moved(state, retained, -moved_s)
         for window, written_s in times.items():
             if window.exists():
                 os.utime(window, (written_s - moved_s, written_s - moved_s))
         before = windows_of(folder)
         with watching(path, truth) as watch:
-            start = watch.look()
+            start = watch.observation()
             watch.play_through(onward, rate(), PATIENCE_S)
             samples = watch.samples
             first_check = next((one for one in samples if one.checks > start.checks), None)
@@ -192,7 +192,7 @@ def test_a_state_and_windows_of_another_time(tmp_path: Path, record_property: Ca
                 f"clock {name}: state at the start, nothing looked at yet",
                 "unknown or degraded, with a reason" if from_future else "not healthy, or of that age",
                 f"{start.state} ({', '.join(start.reasons) or 'no reason'}), age {start.age_s} s",
-                (start.state in SAID and bool(start.reasons)) if from_future else _plausible(start, moved_s),
+                (start.state in REPORTED and bool(start.reasons)) if from_future else _plausible(start, moved_s),
             ),
             Figure(f"clock {name}: right again after one check", "yes", "yes" if right else "no", right),
             exactly(f"clock {name}: windows lost", [], lost),

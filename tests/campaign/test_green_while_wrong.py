@@ -67,7 +67,7 @@ def with_a_rollback(scenario: Scenario, folder: Path, truth: Truth) -> list[Samp
 
         def goes_on(sample: Sample) -> bool:
             if sample.state == "healthy" and not first:
-                first.append(watch.ask(watch.keys.extrinsic(watch.pair))["window_id"])
+                first.append(watch.query(watch.keys.extrinsic(watch.pair))["window_id"])
             return truth.second(sample.stamp_ns) >= scenario.begin_s
 
         assert watch.until(goes_on, _patience_s(scenario))

@@ -20,7 +20,7 @@ from campaign.figures import Figure, at_most, exactly, is_long, publish
 from campaign.health_timeline import (
     PERIOD_S,
     Sample,
-    ServiceEndedError,
+    ServiceFinishedError,
     Watch,
     as_rows,
     configured,
@@ -86,7 +86,7 @@ class Course:
     threads_lost: int = 0
     recovery_s: float | None = None
     state: str = "ended"
-    ended: str | None = None
+    finished: str | None = None
 
     @contextmanager
     def phase(self, watch: Watch, name: str) -> Iterator[None]:
@@ -124,7 +124,7 @@ def run(watch: Watch, truth: Truth, flag: Path, course: Course) -> None:
             course.recovery_s = (time.monotonic() - began_s) * rate()
         watch.passing(a_pass_s)
     course.threads_lost = max(threads - service.num_threads(), 0)
-    course.state = watch.ask(watch.keys.status)["state"]
+    course.state = watch.query(watch.keys.status)["state"]
 
 
 @pytest.mark.fault(
@@ -141,8 +141,8 @@ def test_never_healthy_for_long_while_wrong(tmp_path: Path, record_property: Cal
         watch.play(recording, rate(), loop=True)
         try:
             run(watch, truth, flag, course)
-        except ServiceEndedError as error:
-            course.ended = str(error)
+        except ServiceFinishedError as error:
+            course.finished = str(error)
         errors = watch.errors_logged()
 
     blind = {name: longest(samples, lambda sample: sample.blind, rate()) for name, samples in course.phases.items()}
@@ -154,7 +154,7 @@ def test_never_healthy_for_long_while_wrong(tmp_path: Path, record_property: Cal
     figures += [
         Figure("moments at which a worker was killed", "some", str(course.kills), course.kills > 0),
         exactly("threads of the service that died", 0, course.threads_lost),
-        Figure("the service goes on", "running", course.ended or course.state, course.state == "running"),
+        Figure("the service goes on", "running", course.finished or course.state, course.state == "running"),
         Figure("recovers by itself (sensor time)", "yes", recovery, course.recovery_s is not None),
     ]
     details = {

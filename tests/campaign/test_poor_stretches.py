@@ -25,15 +25,15 @@ PATIENCE_S = 300.0
 def drives() -> list[Drive]:
     """Ten, each with all three in another order and of another length; two in the short form."""
     kinds = ("tunnel", "open_road", "night")
-    chosen = []
+    selected = []
     for seed in range(10 if is_long() else 2):
         faults, begin_s = [], SETTLED_S
         for place in range(3 if is_long() else 2):
             end_s = begin_s + 12 + 3 * ((seed + place) % 4)
             faults.append(f"{kinds[(seed + place) % 3]}:{begin_s}-{end_s}")
             begin_s = end_s + 12
-        chosen.append(Drive(seed + 20, begin_s + 10, tuple(faults)))
-    return chosen
+        selected.append(Drive(seed + 20, begin_s + 10, tuple(faults)))
+    return selected
 
 
 @pytest.mark.fault(
@@ -41,7 +41,7 @@ def drives() -> list[Drive]:
     "it is not accused; nothing changes without its reason, nor more than once a minute",
 )
 def test_a_right_mount_is_not_accused(tmp_path: Path, record_property: Callable[[str, object], None]) -> None:
-    found: dict[str, list[Transition]] = {}
+    result: dict[str, list[Transition]] = {}
     entries: dict[str, Any] = {}
     most_changes, worst_deg = 0, 0.0
     never_well = []
@@ -53,22 +53,22 @@ def test_a_right_mount_is_not_accused(tmp_path: Path, record_property: Callable[
             watch.play_through(recording, rate(), PATIENCE_S + drive.seconds / rate())
             watch.passing(3.0)
             name = f"seed {drive.seed}: {', '.join(drive.faults)}"
-            told = transitions(watch.samples, truth.second)
-            if not any(one.after == "healthy" for one in told):
+            reported = transitions(watch.samples, truth.second)
+            if not any(one.after == "healthy" for one in reported):
                 never_well.append(drive.seed)
-            first = next((place for place, one in enumerate(told) if one.after == "healthy"), len(told) - 1)
-            found[name] = told[first + 1 :]
-            history = watch.ask(watch.keys.history(watch.pair))["entries"]
+            first = next((place for place, one in enumerate(reported) if one.after == "healthy"), len(reported) - 1)
+            result[name] = reported[first + 1 :]
+            history = watch.query(watch.keys.history(watch.pair))["entries"]
             entries[name] = [one["entry"] for one in history if one["entry"]["kind"] == "state"]
             errors = [one.error_deg for one in watch.samples if one.error_deg is not None]
             worst_deg = max(worst_deg, *errors)
-            most_changes = max(most_changes, most_per_minute(found[name]))
-    for name, told in found.items():
+            most_changes = max(most_changes, most_per_minute(result[name]))
+    for name, reported in result.items():
         print(f"\n{name}")
-        for one in told:
+        for one in reported:
             print(f"  {one.second:6.1f} s  {one.before} -> {one.after}  {', '.join(one.reasons)}")
-    accused = [one for told in found.values() for one in told if one.after not in ALLOWED]
-    mute = [one for told in found.values() for one in told if one.after != "healthy" and not one.reasons]
+    accused = [one for reported in result.values() for one in reported if one.after not in ALLOWED]
+    mute = [one for reported in result.values() for one in reported if one.after != "healthy" and not one.reasons]
     figures: list[Figure] = [
         exactly("drives that never were healthy", [], never_well),
         exactly("changes to anything but stale, degraded (and back)", 0, len(accused)),
@@ -78,10 +78,10 @@ def test_a_right_mount_is_not_accused(tmp_path: Path, record_property: Callable[
     ]
     details: dict[str, Any] = {
         "rate": rate(),
-        "transitions": {name: [_row(one) for one in told] for name, told in found.items()},
+        "transitions": {name: [_row(one) for one in reported] for name, reported in result.items()},
         "history": entries,
     }
-    record_property("figure", f"accused {len(accused)} times in {len(found)} drives, {worst_deg:.2f} deg off at most")
+    record_property("figure", f"accused {len(accused)} times in {len(result)} drives, {worst_deg:.2f} deg off at most")
     publish("poor_stretches", tmp_path, figures, details)
 
 

@@ -20,7 +20,7 @@ SMALL = "sim:seed=1&seconds=12&camera_hz=0.5&lidar_hz=0.5&camera=fisheye160&lida
 
 
 @pytest.fixture(autouse=True)
-def drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def rendered_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """A simulated drive is drawn by the first command that opens it, and handed to the others as it is."""
     monkeypatch.setattr("coec_lab.simulation.source.open_sim", rendered_drive)
 

@@ -74,14 +74,14 @@ def test_a_failed_try_leaves_no_folder_that_refuses_the_next(
     assert stopped.status == 1
     assert "absent.onnx" in stopped.err
     assert "--keep-going" in stopped.err
-    kept = coec("batch", recorded, "--output", folder, "--jobs", 1, "--depth", absent, "--keep-going", "--json")
-    assert kept.document["errors"] == {"bad_model": 2}
+    retained = coec("batch", recorded, "--output", folder, "--jobs", 1, "--depth", absent, "--keep-going", "--json")
+    assert retained.document["errors"] == {"bad_model": 2}
 
 
-def test_what_is_not_the_word_of_a_fleet_is_told(coec: Coec, tmp_path: Path) -> None:
-    said = tmp_path / "now.json"
-    said.write_text("{}")
-    outcome = coec("fleet", "report", tmp_path, "--now", said)
+def test_what_is_not_the_text_of_a_fleet_is_reported(coec: Coec, tmp_path: Path) -> None:
+    reported = tmp_path / "now.json"
+    reported.write_text("{}")
+    outcome = coec("fleet", "report", tmp_path, "--now", reported)
     assert outcome.status == 2
     assert "is not what `coec watch --once --json` prints" in outcome.err
 

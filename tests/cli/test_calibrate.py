@@ -51,13 +51,13 @@ def test_text_names_axes_verdict_and_reasons(coec: Coec) -> None:
 def test_text_is_what_one_copies(coec: Coec, tmp_path: Path) -> None:
     arguments = ("calibrate", SMALL, "--depth", "stereo", "--objective", "mi", "--output", tmp_path / "out")
     text = coec(*arguments).out
-    found = json.loads((tmp_path / "out" / "result.json").read_text())["camera_from_lidar"]
+    result = json.loads((tmp_path / "out" / "result.json").read_text())["camera_from_lidar"]
     matrix = re.search(r"\[\[.*?\]\]", text, re.DOTALL)
     quaternion = re.search(r"quaternion x y z w: (\[.*\])", text)
     assert matrix is not None
     assert quaternion is not None
-    np.testing.assert_allclose(json.loads(matrix.group()), found["matrix"], atol=1e-9)
-    np.testing.assert_allclose(json.loads(quaternion.group(1)), found["quaternion_xyzw"], atol=1e-9)
+    np.testing.assert_allclose(json.loads(matrix.group()), result["matrix"], atol=1e-9)
+    np.testing.assert_allclose(json.loads(quaternion.group(1)), result["quaternion_xyzw"], atol=1e-9)
     assert "objective mi, 3 degrees of freedom (rotation only), depth from stereo" in text
     names = "close_ups.png, overlay_after.png, overlay_before.png, report.html, residuals.png, result.json"
     assert f"written to {tmp_path / 'out'}: {names}" in text
@@ -106,11 +106,11 @@ def test_a_lens_that_the_fitted_model_does_not_hold_is_refused(coec: Coec, tmp_p
     assert "--camera-model" in outcome.err
     assert "--output" in outcome.err
     # Where there is a folder, a picture in it shows where the model is off.
-    drawn = tmp_path / "out" / "lens_residual.png"
-    told = coec("calibrate", tmp_path, "--camera-model", "double_sphere", "--output", tmp_path / "out", "--json")
-    assert told.document["picture"] == str(drawn)
-    assert drawn.read_bytes().startswith(b"\x89PNG")
-    assert str(drawn) in told.err
+    rendered = tmp_path / "out" / "lens_residual.png"
+    reported = coec("calibrate", tmp_path, "--camera-model", "double_sphere", "--output", tmp_path / "out", "--json")
+    assert reported.document["picture"] == str(rendered)
+    assert rendered.read_bytes().startswith(b"\x89PNG")
+    assert str(rendered) in reported.err
 
 
 def test_output_folder_holds_pictures_and_the_report(coec: Coec, tmp_path: Path) -> None:
@@ -146,11 +146,11 @@ def test_without_motion_compensation(coec: Coec) -> None:
     assert outcome.document["compensation"]["disabled"] == 6
 
 
-def test_time_offset_is_reported_when_asked_for(coec: Coec) -> None:
+def test_time_offset_is_reported_on_request(coec: Coec) -> None:
     arguments = ("calibrate", SMALL, "--depth", "stereo", "--objective", "mi")
-    asked = coec(*arguments, "--time-offset", "--json").document["time_offset"]
-    assert set(asked) == {"offset_s", "sigma_s", "turn_spread_deg_per_s", "observable", "reason"}
-    assert asked["reason"]
+    requested = coec(*arguments, "--time-offset", "--json").document["time_offset"]
+    assert set(requested) == {"offset_s", "sigma_s", "turn_spread_deg_per_s", "observable", "reason"}
+    assert requested["reason"]
     assert "camera after its stamp" in coec(*arguments, "--time-offset").out
     assert "time_offset" not in coec(*arguments, "--json").document
 
@@ -174,15 +174,15 @@ def test_without_a_network_the_one_that_comes_with_coec_is_used(coec: Coec) -> N
 def test_so_do_the_other_commands(
     coec: Coec, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], module: str
 ) -> None:
-    asked: list[DepthConfig] = []
+    requested: list[DepthConfig] = []
 
     def enough(config: DepthConfig, _: LimitsConfig) -> DepthModel:
-        asked.append(config)
+        requested.append(config)
         raise UsageError("enough")
 
     monkeypatch.setattr(f"{module}.open_depth", enough)
     assert coec(*arguments).status == 2
-    assert asked == [DepthConfig()]
+    assert requested == [DepthConfig()]
 
 
 def test_unknown_objective_is_a_usage_error(coec: Coec) -> None:
@@ -202,8 +202,8 @@ def test_malformed_perturbation(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("count", "wanted", "chosen"),
+    ("count", "expected", "chosen"),
     [(3, 25, [0, 1, 2]), (10, 1, [0]), (10, 2, [0, 9]), (101, 5, [0, 25, 50, 75, 100]), (4, 3, [0, 2, 3])],
 )
-def test_evenly_spreads_over_the_recording(count: int, wanted: int, chosen: list[int]) -> None:
-    assert evenly_spread(count, wanted) == chosen
+def test_evenly_spreads_over_the_recording(count: int, expected: int, selected: list[int]) -> None:
+    assert evenly_spread(count, expected) == selected

@@ -40,5 +40,5 @@ def test_several_topics_are_listed_with_types_and_counts(coec: Coec, tmp_path: P
     assert outcome.status == 1
     assert "/rear/points (sensor_msgs/msg/PointCloud2, 8 messages)" in outcome.err
     assert re.search(r"/odom +nav_msgs/msg/Odometry +20 +\d", outcome.out)
-    told = coec("check", tmp_path / "bag.mcap", "--json")
-    assert (told.status, told.document["error"]["code"]) == (1, "bad_source")
+    reported = coec("check", tmp_path / "bag.mcap", "--json")
+    assert (reported.status, reported.document["error"]["code"]) == (1, "bad_source")

@@ -123,7 +123,7 @@ def test_a_short_configuration_reads_back(tmp_path: Path, path: Path) -> None:
 
 
 @pytest.mark.parametrize("edited", ["coec.yaml", "coec-mask.png"])
-def test_an_edited_file_is_not_overwritten_unless_asked(coec: Coec, tmp_path: Path, edited: str) -> None:
+def test_an_edited_file_is_not_overwritten_unless_requested(coec: Coec, tmp_path: Path, edited: str) -> None:
     path = tmp_path / edited
     path.write_text("a person's work")
     refused = coec("convert", SMALL, tmp_path / "coec.yaml")

@@ -50,7 +50,7 @@ def test_bag_opens_in_ros_tools(coec: Coec, tmp_path: Path) -> None:
     assert bag.latched == {"/tf_static"}
 
 
-def test_a_recording_is_overwritten_only_if_asked(coec: Coec, tmp_path: Path) -> None:
+def test_a_recording_is_overwritten_only_on_request(coec: Coec, tmp_path: Path) -> None:
     path = tmp_path / "drive.mcap"
     path.write_bytes(b"an hour of driving")
     refused = coec("convert", SMALL, path)

@@ -146,8 +146,8 @@ def vehicle(tmp_path_factory: pytest.TempPathFactory) -> Sequence[Finding]:
 
 def of(findings: Sequence[Finding], check: str, where: str) -> tuple[str, str]:
     """Level and text of the one finding about this."""
-    (found,) = [one for one in findings if (one.check, one.where) == (check, where)]
-    return found.level, found.text
+    (result,) = [one for one in findings if (one.check, one.where) == (check, where)]
+    return result.level, result.text
 
 
 def key(pair: str, stream: str) -> str:
@@ -159,8 +159,8 @@ def test_what_is_in_order_is_ok(vehicle: Sequence[Finding]) -> None:
     assert {one.check for one in about} == {"stream", "stamps", "in_step", "point_times", "image"}
     assert [one for one in about if one.level != "ok"] == []
     for check in ("configuration", "network", "state", "lock", "disk", "writing", "router", "session", "rules"):
-        (found,) = [one for one in vehicle if one.check == check]
-        assert found.level == "ok", found
+        (result,) = [one for one in vehicle if one.check == check]
+        assert result.level == "ok", result
     assert any(one.check == "service" and "no service" in one.text for one in vehicle)
 
 
@@ -171,7 +171,7 @@ def test_a_stream_that_is_silent_fails(vehicle: Sequence[Finding]) -> None:
         assert (level, "no sample" in text) == ("fail", True)
 
 
-def test_a_slow_stream_is_told(vehicle: Sequence[Finding]) -> None:
+def test_a_slow_stream_is_reported(vehicle: Sequence[Finding]) -> None:
     for stream in ("camera", "ego"):
         level, _ = of(vehicle, "stream", key("slow", stream))
         assert level in ADVISED, stream
@@ -188,12 +188,12 @@ def test_a_rate_is_judged_by_what_a_check_wants(tmp_path: Path, rate_hz: float, 
     for number in range(count):
         camera.arrivals_s.append(number / rate_hz)
         camera.sizes.append(1000)
-    found = list(stream_findings(pair, {"camera": camera, "lidar": silent}, config, 5.0, RosTopicList()))
-    assert of(found, "stream", pair.camera.place)[0] == level
-    assert of(found, "stream", pair.lidar.place)[0] == "fail"
+    result = list(stream_findings(pair, {"camera": camera, "lidar": silent}, config, 5.0, RosTopicList()))
+    assert of(result, "stream", pair.camera.place)[0] == level
+    assert of(result, "stream", pair.lidar.place)[0] == "fail"
 
 
-def test_a_clock_an_hour_off_is_told(vehicle: Sequence[Finding]) -> None:
+def test_a_clock_an_hour_off_is_reported(vehicle: Sequence[Finding]) -> None:
     level, text = of(vehicle, "stamps", key("behind", "camera"))
     assert level == "warn"
     assert "3600.0 s behind the clock of this computer" in text
@@ -202,10 +202,10 @@ def test_a_clock_an_hour_off_is_told(vehicle: Sequence[Finding]) -> None:
 
 
 @pytest.mark.fault("clocks of camera and LiDAR an hour apart", "the doctor says so, and that no pair comes of it")
-def test_two_clocks_an_hour_apart_make_no_pairs(vehicle: Sequence[Finding]) -> None:
-    (apart,) = [one for one in vehicle if one.where == "apart" and one.text.startswith("camera and LiDAR")]
-    assert apart.level == "fail"
-    assert "0 % of the frames have a sweep" in apart.text
+def test_two_clocks_an_hour_from_each_other_make_no_pairs(vehicle: Sequence[Finding]) -> None:
+    (separation,) = [one for one in vehicle if one.where == "apart" and one.text.startswith("camera and LiDAR")]
+    assert separation.level == "fail"
+    assert "0 % of the frames have a sweep" in separation.text
 
 
 @pytest.mark.fault("frames that cannot be decoded", "the doctor says of which stream, and why")
@@ -216,7 +216,7 @@ def test_what_cannot_be_decoded_fails_and_says_why(vehicle: Sequence[Finding]) -
     assert not [one for one in vehicle if one.check == "decoding" and "damaged/lidar" in one.where]
 
 
-def test_point_times_are_looked_at(vehicle: Sequence[Finding]) -> None:
+def test_point_times_are_checked(vehicle: Sequence[Finding]) -> None:
     level, text = of(vehicle, "point_times", key("wrong-unit", "lidar"))
     assert (level, "further than two sweeps" in text) == ("fail", True)
     level, text = of(vehicle, "point_times", key("no-times", "lidar"))
@@ -229,44 +229,44 @@ def test_whatever_is_not_in_order_has_an_advice(vehicle: Sequence[Finding]) -> N
 
 @pytest.mark.parametrize(("level", "status"), [("ok", 0), ("warn", 0), ("fail", 1)])
 def test_only_what_failed_makes_it_fail(coec: Coec, monkeypatch: pytest.MonkeyPatch, level: str, status: int) -> None:
-    found = Finding.model_validate(
+    result = Finding.model_validate(
         {"check": "disk", "level": level, "where": "/var", "text": "what it is like", "advice": "what to do"}
     )
-    monkeypatch.setattr("coec.cli.doctor.examine", lambda *_: iter([found]))
-    told = coec("doctor")
-    assert told.status == status
-    assert f"{level:<5}disk          /var: what it is like\n     → what to do\n" in told.out
+    monkeypatch.setattr("coec.cli.doctor.examine", lambda *_: iter([result]))
+    reported = coec("doctor")
+    assert reported.status == status
+    assert f"{level:<5}disk          /var: what it is like\n     → what to do\n" in reported.out
     report = coec("doctor", "--json").document
     assert report["healthy"] is (status == 0)
-    assert report["findings"] == [json.loads(found.model_dump_json())]
+    assert report["findings"] == [json.loads(result.model_dump_json())]
 
 
 # --- the way to the router --------------------------------------------------------------------------------------------
 
 
-def test_no_router_is_told_and_fails(coec: Coec, tmp_path: Path) -> None:
+def test_no_router_is_reported_and_fails(coec: Coec, tmp_path: Path) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     path = written(tmp_path, ZenohConfig(connect=(endpoint,), listen=(endpoint,)), "front")
     outcome = coec("doctor", "--config", path, "--json")
     assert outcome.status == 1
     report = json.loads(outcome.out)
     assert report["healthy"] is False
-    (found,) = [one for one in report["findings"] if one["check"] == "router"]
-    assert (found["level"], found["where"]) == ("fail", endpoint)
-    assert "nothing listens at this port" in found["text"]
+    (result,) = [one for one in report["findings"] if one["check"] == "router"]
+    assert (result["level"], result["where"]) == ("fail", endpoint)
+    assert "nothing listens at this port" in result["text"]
     assert "session" not in [one["check"] for one in report["findings"]], "there is nobody to talk to"
 
 
 @pytest.mark.fault("another program at the port of the router", "the doctor distinguishes this from a missing router")
-def test_a_port_at_which_something_else_answers_is_told_from_none(
+def test_a_port_at_which_something_else_answers_is_distinguished_from_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(environment, "CONNECT_S", 1.0)
     with socket.create_server(("127.0.0.1", 0)) as other:
         endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
-        found = list(examine(written(tmp_path, ZenohConfig(connect=(endpoint,)), "front"), 0.5))
-    assert of(found, "router", endpoint)[0] == "ok"
-    level, text = of(found, "session", endpoint)
+        result = list(examine(written(tmp_path, ZenohConfig(connect=(endpoint,)), "front"), 0.5))
+    assert of(result, "router", endpoint)[0] == "ok"
+    level, text = of(result, "session", endpoint)
     assert (level, text) == ("fail", "no Zenoh session can be opened")
 
 
@@ -335,7 +335,7 @@ def guarded(authority: Path) -> Iterator[int]:
         yield port
 
 
-def found_with(authority: Path, port: int, name: str, folder: Path, vehicle: str = "vehicle") -> dict[str, Finding]:
+def result_with(authority: Path, port: int, name: str, folder: Path, vehicle: str = "vehicle") -> dict[str, Finding]:
     """What is found on the way to the router, by check, with one of the certificates."""
     tls = {
         "root_ca_certificate": str(authority / "ca.pem"),
@@ -347,15 +347,15 @@ def found_with(authority: Path, port: int, name: str, folder: Path, vehicle: str
     session = {"connect": {"endpoints": [f"tls/127.0.0.1:{port}"]}, "transport": {"link": {"tls": tls}}}
     file.write_text(json.dumps(session))
     config = pair_configuration(folder).model_copy(update={"zenoh": ZenohConfig(file=file), "vehicle": vehicle})
-    found = [*environment.certificate_findings(config), *environment.router_findings(config)]
+    result = [*environment.certificate_findings(config), *environment.router_findings(config)]
     with_session = environment.session_of_client(config)
-    found.append(environment.session_finding(config, with_session))
+    result.append(environment.session_finding(config, with_session))
     if with_session is not None:
         as_of_service = environment.session_as_of_service(config)
         assert as_of_service is not None
         with with_session, as_of_service:
-            found.append(environment.rules_finding(config, as_of_service, with_session))
-    return {one.check: one for one in found}
+            result.append(environment.rules_finding(config, as_of_service, with_session))
+    return {one.check: one for one in result}
 
 
 @pytest.fixture
@@ -369,21 +369,21 @@ def soon(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_certificate_that_is_good_leads_to_a_session_that_may_speak(
     authority: Path, guarded: int, tmp_path: Path
 ) -> None:
-    found = found_with(authority, guarded, "vehicle", tmp_path)
-    assert {check: one.level for check, one in found.items()} == dict.fromkeys(
+    result = result_with(authority, guarded, "vehicle", tmp_path)
+    assert {check: one.level for check, one in result.items()} == dict.fromkeys(
         ("certificate", "router", "tls", "session", "rules"), "ok"
     )
-    assert "127.0.0.1" in found["tls"].text
-    assert found_with(authority, guarded, "soon", tmp_path)["certificate"].level == "warn"
+    assert "127.0.0.1" in result["tls"].text
+    assert result_with(authority, guarded, "soon", tmp_path)["certificate"].level == "warn"
 
 
 @pytest.mark.usefixtures("soon")
 @pytest.mark.fault("a certificate that has expired", "the doctor names it, its day, and who refuses it")
 def test_an_expired_certificate_is_named(authority: Path, guarded: int, tmp_path: Path) -> None:
-    found = found_with(authority, guarded, "expired", tmp_path)
-    assert "'vehicle' has expired on 20" in found["certificate"].text
-    assert found["tls"].text == "the other end refuses: certificate expired"
-    assert [found[check].level for check in ("certificate", "router", "tls", "session")] == [
+    result = result_with(authority, guarded, "expired", tmp_path)
+    assert "'vehicle' has expired on 20" in result["certificate"].text
+    assert result["tls"].text == "the other end refuses: certificate expired"
+    assert [result[check].level for check in ("certificate", "router", "tls", "session")] == [
         "fail",
         "ok",
         "fail",
@@ -392,11 +392,11 @@ def test_an_expired_certificate_is_named(authority: Path, guarded: int, tmp_path
 
 
 @pytest.mark.usefixtures("soon")
-def test_a_foreign_certificate_is_told_from_no_router(authority: Path, guarded: int, tmp_path: Path) -> None:
-    found = found_with(authority, guarded, "foreign", tmp_path)
-    assert found["certificate"].level == "fail"
-    assert found["tls"].text.startswith("the other end refuses: ")
-    assert found["router"].level == "ok"
+def test_a_foreign_certificate_is_distinguished_from_no_router(authority: Path, guarded: int, tmp_path: Path) -> None:
+    result = result_with(authority, guarded, "foreign", tmp_path)
+    assert result["certificate"].level == "fail"
+    assert result["tls"].text.startswith("the other end refuses: ")
+    assert result["router"].level == "ok"
 
 
 @pytest.mark.usefixtures("soon")
@@ -404,10 +404,10 @@ def test_a_foreign_certificate_is_told_from_no_router(authority: Path, guarded: 
     "rules of the router that refuse the service",
     "the doctor distinguishes this from a missing router and from missing TLS",
 )
-def test_rules_that_refuse_are_told_from_no_router(authority: Path, guarded: int, tmp_path: Path) -> None:
-    found = found_with(authority, guarded, "vehicle", tmp_path, vehicle="other")
-    assert [found[check].level for check in ("router", "tls", "session", "rules")] == ["ok", "ok", "ok", "fail"]
-    assert "its access control refuses" in found["rules"].text
+def test_rules_that_refuse_are_distinguished_from_no_router(authority: Path, guarded: int, tmp_path: Path) -> None:
+    result = result_with(authority, guarded, "vehicle", tmp_path, vehicle="other")
+    assert [result[check].level for check in ("router", "tls", "session", "rules")] == ["ok", "ok", "ok", "fail"]
+    assert "its access control refuses" in result["rules"].text
 
 
 def material(folder: Path, certificate: str, key: str, root: str = "ca") -> TlsFiles:
@@ -416,7 +416,7 @@ def material(folder: Path, certificate: str, key: str, root: str = "ca") -> TlsF
     )
 
 
-def test_files_that_do_not_belong_together_are_told(authority: Path) -> None:
+def test_files_that_do_not_belong_together_are_reported(authority: Path) -> None:
     assert read_certificate(material(authority, "router", "router"), "listen").names == ("localhost", "127.0.0.1")
     assert read_certificate(material(authority, "expired", "expired"), "connect").not_after_s < time.time()
     for wrong, why in (
@@ -484,7 +484,7 @@ def test_a_state_directory_that_cannot_be_made_fails(tmp_path: Path) -> None:
     assert not (tmp_path / "new").exists()
 
 
-def test_a_cold_cache_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cold_cache_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
     cold = environment.kernels_finding()
     assert (cold.level, cold.where) == ("warn", str(tmp_path))
@@ -502,13 +502,13 @@ def test_a_cold_cache_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         (None, "warn"),
     ],
 )
-def test_a_clock_that_nobody_keeps_is_told(
+def test_a_clock_that_nobody_keeps_is_reported(
     monkeypatch: pytest.MonkeyPatch, state: system.ClockState | None, level: str
 ) -> None:
     monkeypatch.setattr(environment, "clock_state", lambda: state)
     assert environment.clock_finding().level == level
 
 
-def test_the_kernel_tells_of_its_clock() -> None:
-    told = system.clock_state()
-    assert told is None or told.max_error_s > 0
+def test_the_kernel_reports_of_its_clock() -> None:
+    reported = system.clock_state()
+    assert reported is None or reported.max_error_s > 0

@@ -70,7 +70,7 @@ def sending(endpoint: str) -> Iterator[None]:
                 driver.close()
 
 
-def found(folder: Path, endpoint: str, session: Mapping[str, object] | None) -> Sequence[Finding]:
+def result(folder: Path, endpoint: str, session: Mapping[str, object] | None) -> Sequence[Finding]:
     """What the doctor finds for the eight lines of a ROS vehicle, with this Zenoh file."""
     file = folder / "session.json5"
     if session is not None:
@@ -113,7 +113,7 @@ def test_what_the_service_receives_is_in_order(
 ) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with router(endpoint), sending(endpoint):
-        findings = found(tmp_path, endpoint, session)
+        findings = result(tmp_path, endpoint, session)
     for topic in TOPICS:
         stream = of(findings, "stream", topic)
         assert (stream.level, "Hz" in stream.text) == ("ok", True), stream
@@ -148,7 +148,7 @@ def test_what_the_service_does_not_receive_has_its_cause(
 ) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with router(endpoint), sending(endpoint):
-        findings = found(tmp_path, endpoint, session)
+        findings = result(tmp_path, endpoint, session)
     for topic in TOPICS:
         stream = of(findings, "stream", topic)
         assert stream.level == "fail"
@@ -174,6 +174,6 @@ def test_the_service_that_runs_is_not_disturbed_by_a_second_session_of_its_setti
         zenoh.open(ros.rmw_settings(ros.RMW_SESSION, taken)) as service,
         sending(endpoint),
     ):
-        findings = found(tmp_path, endpoint, own)
+        findings = result(tmp_path, endpoint, own)
         assert service.info.zid() in list(router.info.peers_zid())
     assert of(findings, "stream", CAMERA).level == "ok"

@@ -34,9 +34,9 @@ def configured(middleware: str = "rmw_zenoh", **ros: Any) -> Config:
 
 
 def test_topics_that_may_be_streams_are_named_with_types_and_nodes() -> None:
-    (found,) = topic_findings(THERE, THERE, configured(domain=7))
-    assert (found.level, found.where) == ("ok", "domain 7")
-    assert found.text == (
+    (result,) = topic_findings(THERE, THERE, configured(domain=7))
+    assert (result.level, result.where) == ("ok", "domain 7")
+    assert result.text == (
         "/front/image (sensor_msgs/msg/Image, by /left, /right); /top/points (sensor_msgs/msg/PointCloud2); "
         "1 of other types"
     )
@@ -44,42 +44,42 @@ def test_topics_that_may_be_streams_are_named_with_types_and_nodes() -> None:
 
 def test_a_vehicle_with_very_many_names_some() -> None:
     many = RosTopicList(tuple(Publisher(f"/image{number:03}", IMAGE, "/node", None) for number in range(NAMED + 5)))
-    (found,) = topic_findings(many, many, configured())
-    assert found.text.count("/image") == NAMED
-    assert "; 5 more such; 0 of other types" in found.text
+    (result,) = topic_findings(many, many, configured())
+    assert result.text.count("/image") == NAMED
+    assert "; 5 more such; 0 of other types" in result.text
 
 
 def test_topics_that_only_a_client_of_the_router_sees_are_named() -> None:
     here = RosTopicList(tuple(one for one in THERE.publishers if one.topic != "/top/points"))
-    _, found = topic_findings(here, THERE, configured())
-    assert found.level == "fail"
-    assert "the service does not see /top/points: " in found.text
+    _, result = topic_findings(here, THERE, configured())
+    assert result.level == "fail"
+    assert "the service does not see /top/points: " in result.text
 
 
 @pytest.mark.parametrize(("middleware", "where"), [("rmw_zenoh", "domain 0"), ("ros2dds", "bridge")])
-def test_nobody_there_is_told_with_what_may_be_wrong(middleware: str, where: str) -> None:
-    (found,) = topic_findings(RosTopicList(), RosTopicList(), configured(middleware))
-    assert (found.level, found.where) == ("warn", where)
-    assert found.advice is not None
-    assert "@ros2_lv/**" in found.advice
+def test_nobody_there_is_reported_with_what_may_be_wrong(middleware: str, where: str) -> None:
+    (result,) = topic_findings(RosTopicList(), RosTopicList(), configured(middleware))
+    assert (result.level, result.where) == ("warn", where)
+    assert result.advice is not None
+    assert "@ros2_lv/**" in result.advice
 
 
-def test_tokens_that_were_not_read_are_told() -> None:
+def test_tokens_that_were_not_read_are_reported() -> None:
     there = RosTopicList(THERE.publishers, Counter(too_many=7, malformed=2))
-    *_, found = topic_findings(there, there, configured())
-    assert (found.level, "2 malformed, 7 too_many" in found.text) == ("warn", True)
+    *_, result = topic_findings(there, there, configured())
+    assert (result.level, "2 malformed, 7 too_many" in result.text) == ("warn", True)
 
 
-def test_a_silent_stream_is_told_with_who_is_there_and_two_senders_by_name() -> None:
+def test_a_silent_stream_is_reported_with_who_is_there_and_two_senders_by_name() -> None:
     config = configured()
     (pair,) = config.pairs
     camera = StreamSamples("/front/image", counts=StreamCounts(9, 9, (LEFT, RIGHT), stamped_by_sender=True))
-    heard = {"camera": camera, "lidar": StreamSamples("/rear/points")}
-    found = list(stream_findings(pair, heard, config, 1.0, THERE))
-    (silent,) = [one for one in found if one.where == "/rear/points"]
+    received = {"camera": camera, "lidar": StreamSamples("/rear/points")}
+    result = list(stream_findings(pair, received, config, 1.0, THERE))
+    (silent,) = [one for one in result if one.where == "/rear/points"]
     assert (silent.level, "no publisher of /rear/points; there are: /top/points" in silent.text) == ("fail", True)
-    (unheard,) = [one for one in found if one.where == "/front/image"]
+    (unheard,) = [one for one in result if one.where == "/front/image"]
     assert "no publisher" not in unheard.text
-    senders, clock = [one.text for one in found if one.check == "senders"]
+    senders, clock = [one.text for one in result if one.check == "senders"]
     assert senders.startswith("2 publishers send on /front/image at the same time: /left, /right.")
     assert "the stamp from the sender's clock" in clock

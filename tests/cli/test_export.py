@@ -26,7 +26,7 @@ CLOCKS = Clocks(None, None, None)
 SERVED = after_estimate(initial_state(ESTIMATE_RIG), estimate(1), 0, RULES)
 
 
-def kept(folder: Path, state: PairState) -> None:
+def retained(folder: Path, state: PairState) -> None:
     store = StateStore(folder, "v7")
     store.update(ESTIMATE_RIG, state, CLOCKS, dict)
     store.flush()
@@ -43,7 +43,7 @@ def result(tmp_path: Path) -> Path:
 def state(tmp_path: Path) -> Path:
     folder = tmp_path / "state"
     folder.mkdir()
-    kept(folder, SERVED)
+    retained(folder, SERVED)
     return folder
 
 
@@ -65,16 +65,16 @@ def test_a_state_directory_gives_what_is_served(coec: Coec, state: Path, inside:
     assert outcome.document["window_id"] == "front-1"
 
 
-def test_a_reply_of_a_service_gives_what_it_tells(coec: Coec, tmp_path: Path) -> None:
+def test_a_reply_of_a_service_gives_what_it_reports(coec: Coec, tmp_path: Path) -> None:
     accepted = result_of(estimate(1), ESTIMATE_RIG, "v7")
     reply = extrinsic_of("v7", ESTIMATE_RIG, SERVED, accepted, 0.0, "hash")
     path = tmp_path / "extrinsic.json"
     path.write_bytes(to_json(reply))
     document = coec("export", path, "--format", "json").document
     np.testing.assert_array_equal(document["T_child_parent"], SERVED.T_camera_lidar)
-    told = np.array(document["covariance_rad_m"], dtype=float)
-    np.testing.assert_allclose(told.diagonal(), estimate(1).uncertainty.covariance.diagonal(), rtol=1e-12)
-    np.testing.assert_allclose(told[0, 4], estimate(1).uncertainty.covariance[0, 4], rtol=1e-9)
+    reported = np.array(document["covariance_rad_m"], dtype=float)
+    np.testing.assert_allclose(reported.diagonal(), estimate(1).uncertainty.covariance.diagonal(), rtol=1e-12)
+    np.testing.assert_allclose(reported[0, 4], estimate(1).uncertainty.covariance[0, 4], rtol=1e-9)
 
 
 def holders(folder: Path) -> dict[str, Path]:
@@ -84,7 +84,7 @@ def holders(folder: Path) -> dict[str, Path]:
     for name, model in files.items():
         (folder / f"{name}.json").write_bytes(to_json(model))
     (folder / "state").mkdir()
-    kept(folder / "state", SERVED)
+    retained(folder / "state", SERVED)
     return {**{name: folder / f"{name}.json" for name in files}, "state": folder / "state"}
 
 
@@ -98,8 +98,8 @@ def test_the_intrinsics_that_it_was_estimated_with_come_along(coec: Coec, tmp_pa
     assert chain["intrinsics"] == [camera.fx, camera.fy, camera.cx, camera.cy]
     assert chain["resolution"] == [camera.width, camera.height]
     assert coec("export", path, "--format", "nuscenes").document[0]["camera_intrinsic"] == K
-    told = coec("export", path, "--format", "json").document["camera"]
-    assert told == {"model": "pinhole", **cameras.intrinsics_of(camera)}
+    reported = coec("export", path, "--format", "json").document["camera"]
+    assert reported == {"model": "pinhole", **cameras.intrinsics_of(camera)}
 
 
 @pytest.mark.parametrize(
@@ -125,8 +125,8 @@ def test_the_parent_may_be_another_frame_than_the_lidar(coec: Coec, result: Path
     pose = "0.5,0,1.7,0,0,0.7071067811865476,0.7071067811865476"
     outcome = coec("export", result, "--format", "json", "--parent", "base_link", "--parent-pose", pose)
     T_parent_lidar = np.array([[0.0, -1, 0, 0.5], [1, 0, 0, 0], [0, 0, 1, 1.7], [0, 0, 0, 1]])
-    wanted = estimate(1).optimum.T_camera_lidar @ se3.inverse(T_parent_lidar)
-    np.testing.assert_allclose(outcome.document["T_child_parent"], wanted, atol=1e-12)
+    expected = estimate(1).optimum.T_camera_lidar @ se3.inverse(T_parent_lidar)
+    np.testing.assert_allclose(outcome.document["T_child_parent"], expected, atol=1e-12)
 
 
 def test_what_is_not_accepted_is_refused_and_forced(coec: Coec, tmp_path: Path) -> None:
@@ -144,7 +144,7 @@ def test_what_is_not_accepted_is_refused_and_forced(coec: Coec, tmp_path: Path) 
 
 
 def test_a_nominal_state_is_refused(coec: Coec, tmp_path: Path) -> None:
-    kept(tmp_path, initial_state(ESTIMATE_RIG))
+    retained(tmp_path, initial_state(ESTIMATE_RIG))
     outcome = coec("export", tmp_path, "--format", "tf")
     assert outcome.status == 2
     assert "nothing was accepted yet" in outcome.err
@@ -163,22 +163,22 @@ def test_a_file_is_replaced_whole_and_stays_what_it_was(coec: Coec, result: Path
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("--format", "ros"), "known are autoware, colmap, json"),
         (("--format", "tf", "--parent-pose", "1,2"), "seven finite numbers"),
         (("--format", "tf", "--parent", "a b"), "names no frame"),
     ],
 )
-def test_what_does_not_fit_is_said(coec: Coec, result: Path, arguments: tuple[str, ...], said: str) -> None:
+def test_what_does_not_fit_is_reported(coec: Coec, result: Path, arguments: tuple[str, ...], message: str) -> None:
     outcome = coec("export", result, *arguments)
     assert outcome.status in (1, 2)
-    assert said in outcome.err
+    assert message in outcome.err
     assert outcome.out == ""
 
 
 @pytest.mark.parametrize("content", [b"", b"{}", b"[]", b"\xff", b'{"verdict": 1}', b"[" * 100_000])
-def test_what_is_no_calibration_is_said(coec: Coec, tmp_path: Path, content: bytes) -> None:
+def test_what_is_no_calibration_is_reported(coec: Coec, tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "x.json"
     path.write_bytes(content)
     outcome = coec("export", path, "--format", "tf")

@@ -107,7 +107,7 @@ class Page(HTMLParser):
 
 
 @pytest.mark.usefixtures("vehicle")
-def test_an_event_comes_home_as_one_folder_that_tells_its_story(coec: Coec, router: Router, tmp_path: Path) -> None:
+def test_an_event_comes_home_as_one_folder_with_its_history(coec: Coec, router: Router, tmp_path: Path) -> None:
     folder = tmp_path / "event"
     listed = coec("fetch", VEHICLE, "--connect", router.endpoint, "--json")
     (event,) = listed.document["events"]
@@ -127,15 +127,15 @@ def test_an_event_comes_home_as_one_folder_that_tells_its_story(coec: Coec, rout
     assert [window.in_history for window in report.windows] == [True, True]
     assert report.chain_holds is True
     page = Page((folder / "index.html").read_text())
-    beside = {name for name in page.loads if not name.startswith(("#", "data:image/"))}
-    assert beside <= there, "it leads nowhere else"
+    neighbour = {name for name in page.loads if not name.startswith(("#", "data:image/"))}
+    assert neighbour <= there, "it leads nowhere else"
     assert {"before.jpg", "after.jpg"} <= set(page.loads)
-    for told in (event["reasons"][0]["text"], event["resolution"], event["window_after"], "accepted"):
-        assert told in page.text
+    for reported in (event["reasons"][0]["text"], event["resolution"], event["window_after"], "accepted"):
+        assert reported in page.text
     assert not {"link", "iframe"} & page.tags
 
 
-def test_whoever_asks_again_fetches_no_window_twice(
+def test_whoever_requests_again_fetches_no_window_twice(
     coec: Coec, router: Router, vehicle: ServingVehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, read = tmp_path / "event", []
@@ -180,7 +180,7 @@ def test_whatever_is_fetched_is_metered_and_waited_for(
 
 @pytest.mark.usefixtures("vehicle")
 @pytest.mark.parametrize(
-    ("arguments", "status", "said"),
+    ("arguments", "status", "message"),
     [
         (("../x",), UsageError.exit_code, "is not a valid name of a vehicle"),
         ((VEHICLE, "../../etc/passwd"), UsageError.exit_code, "is not the id of an incident"),
@@ -188,22 +188,22 @@ def test_whatever_is_fetched_is_metered_and_waited_for(
         (("nobody", "latest"), NotFoundError.exit_code, "nobody answered"),
     ],
 )
-def test_what_is_not_there_is_said(
+def test_what_is_not_there_is_reported(
     coec: Coec,
     router: Router,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     arguments: tuple[str, ...],
     status: int,
-    said: str,
+    message: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     outcome = coec("fetch", *arguments, "--connect", router.endpoint)
     assert (outcome.status, list(tmp_path.iterdir())) == (status, [])
-    assert said in outcome.err
+    assert message in outcome.err
 
 
-def test_of_a_vehicle_that_is_parked_its_last_word_is_told(coec: Coec, router: Router) -> None:
+def test_of_a_vehicle_that_is_parked_its_last_text_is_reported(coec: Coec, router: Router) -> None:
     key = Keys("coec", "truck-3").last("front")
     with (
         MemoryStorage(router.session, Keys("coec", "*").last("*")) as storage,
@@ -242,9 +242,9 @@ def test_snippets_of_an_event_are_bounded(tmp_path: Path, monkeypatch: pytest.Mo
     listed = WindowsReply(vehicle=VEHICLE, pair=PAIR, windows=(), snippets=snippets)
     monkeypatch.setattr(cli_fetch.Download, "_document", lambda *_: listed)
     monkeypatch.setattr(cli_fetch.Download, "_recording", lambda *_: snippets[0])
-    found = sorted(bench._snippets(cast(Any, SimpleNamespace(stamp_ns=100))))
+    detected = sorted(bench._snippets(cast(Any, SimpleNamespace(stamp_ns=100))))
     nearest = sorted(f"front-{n}.snippet" for n in range(92, 108))
-    assert (found, len(found)) == (nearest, cli_fetch.MAX_SNIPPETS)
+    assert (detected, len(detected)) == (nearest, cli_fetch.MAX_SNIPPETS)
     (absent,) = bench.absent
     assert (absent.what, "lists 1000" in absent.why) == ("984 snippets", True)
 
@@ -255,10 +255,17 @@ def test_snippets_of_an_event_are_bounded(tmp_path: Path, monkeypatch: pytest.Mo
 class Sender:
     """Has one window, and answers for its pieces as it is told to: `answer(offset, length)` gives bytes, or a code."""
 
-    def __init__(self, session: zenoh.Session, keys: Keys, answer: Callable[[int, int], bytes | str], **told: Any):
-        self.asked: list[int] = []
+    def __init__(self, session: zenoh.Session, keys: Keys, answer: Callable[[int, int], bytes | str], **reported: Any):
+        self.requested: list[int] = []
         self._answer = answer
-        info = {"window_id": WINDOW, "sha256": SHA256, "size_bytes": len(DATA), "pairs": 1, "decision": None, **told}
+        info = {
+            "window_id": WINDOW,
+            "sha256": SHA256,
+            "size_bytes": len(DATA),
+            "pairs": 1,
+            "decision": None,
+            **reported,
+        }
         listed = WindowsReply(vehicle=keys.vehicle, pair=PAIR, windows=(WindowInfo.model_validate(info),))
         self._declared = [
             session.declare_queryable(keys.windows(PAIR), lambda query: self._list(query, to_json(listed))),
@@ -276,9 +283,9 @@ class Sender:
 
     def _piece(self, query: zenoh.Query) -> None:
         with query:
-            chosen = parse_range_selector(str(query.parameters))
-            self.asked.append(chosen.offset)
-            answer = self._answer(chosen.offset, chosen.length)
+            selected = parse_range_selector(str(query.parameters))
+            self.requested.append(selected.offset)
+            answer = self._answer(selected.offset, selected.length)
             if isinstance(answer, bytes):
                 query.reply(query.key_expr, answer)
             else:
@@ -311,18 +318,18 @@ def test_a_window_goes_on_where_the_link_broke(
         fetch(router, far, path)
     assert not path.exists()
     broken[0] = False
-    before = len(sender.asked)
+    before = len(sender.requested)
     assert fetch(router, far, path).sha256 == SHA256
     sender.end()
     assert path.read_bytes() == DATA
-    again = [offset for offset in sender.asked[before:] if offset < 2 * PIECE_BYTES]
+    again = [offset for offset in sender.requested[before:] if offset < 2 * PIECE_BYTES]
     record_property("figure", f"{len(again)} pieces fetched twice")
     assert again == []
     assert [each.name for each in tmp_path.iterdir()] == ["w.mcap"]
 
 
 @pytest.mark.fault("a disk with too little room for a window", "nothing is fetched, and how much is needed is said")
-def test_a_window_for_which_there_is_no_room_is_not_begun(
+def test_a_window_for_which_there_is_no_room_is_not_started(
     router: Router, far: Keys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sender = Sender(router.session, far, whole)
@@ -330,14 +337,14 @@ def test_a_window_for_which_there_is_no_room_is_not_begun(
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=free))
     with pytest.raises(NoSpaceError, match=f"{len(DATA)} bytes are to be fetched, {free} are free"):
         fetch(router, far, tmp_path / "w.mcap")
-    assert (sender.asked, list(tmp_path.iterdir())) == ([], [])
+    assert (sender.requested, list(tmp_path.iterdir())) == ([], [])
     free += 1
     fetch(router, far, tmp_path / "w.mcap")
     sender.end()
 
 
 @pytest.mark.fault("the vehicle's uplink is busy", "the piece is asked for again until it comes, or patience ends")
-def test_who_is_told_to_wait_waits(router: Router, far: Keys, tmp_path: Path) -> None:
+def test_who_is_reported_to_wait_waits(router: Router, far: Keys, tmp_path: Path) -> None:
     refusals = iter(["uplink_busy", "busy"])
     sender = Sender(router.session, far, lambda at, n: next(refusals, None) or whole(at, n))
     fetch(router, far, tmp_path / "w.mcap", patience_s=30.0)
@@ -352,7 +359,7 @@ def test_who_is_told_to_wait_waits(router: Router, far: Keys, tmp_path: Path) ->
 
 @pytest.mark.fault("bytes of a window that are wrong, too many, or missing", "the file does not get its name")
 @pytest.mark.parametrize(
-    ("answer", "told", "code"),
+    ("answer", "reported", "code"),
     [
         (lambda _, n: bytes(n), {}, "checksum"),
         (lambda at, n: whole(at, n) + b"x", {}, "checksum"),
@@ -364,9 +371,9 @@ def test_who_is_told_to_wait_waits(router: Router, far: Keys, tmp_path: Path) ->
     ids=["others", "more", "none", "a byte at a time", "too large", "a path"],
 )
 def test_what_is_not_what_was_promised_is_no_window(
-    router: Router, far: Keys, tmp_path: Path, answer: Callable[[int, int], bytes], told: dict[str, Any], code: str
+    router: Router, far: Keys, tmp_path: Path, answer: Callable[[int, int], bytes], reported: dict[str, Any], code: str
 ) -> None:
-    sender = Sender(router.session, far, answer, **told)
+    sender = Sender(router.session, far, answer, **reported)
     with pytest.raises(RemoteError) as refused:
         fetch(router, far, tmp_path / "in" / "w.mcap")
     sender.end()

@@ -37,7 +37,7 @@ def test_writes_the_baseline_of_the_model(coec: Coec, rigs: list[Path], tmp_path
     assert "front: 3 vehicles, 120 pairs of 6 windows" in shown.out
 
 
-def test_what_cannot_be_used_is_told(coec: Coec, rigs: list[Path], tmp_path: Path) -> None:
+def test_what_cannot_be_used_is_reported(coec: Coec, rigs: list[Path], tmp_path: Path) -> None:
     output = tmp_path / "model.json"
     for named, says in (
         ([*rigs, rigs[0]], "named twice"),

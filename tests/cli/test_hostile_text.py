@@ -101,18 +101,18 @@ def vehicle(router: Router) -> Iterator[str]:
     refusal = message.to_json(hostile_message(ErrorReply))
 
     def answer(key: str, payload: bytes, encoding: str) -> Callable[[zenoh.Query], None]:
-        def reply(asked: zenoh.Query) -> None:
-            with asked:
-                asked.reply(key, payload, encoding=encoding)
+        def reply(requested: zenoh.Query) -> None:
+            with requested:
+                requested.reply(key, payload, encoding=encoding)
 
         return reply
 
-    def refuse(asked: zenoh.Query) -> None:
-        with asked:
-            asked.reply_err(refusal, encoding=JSON)
+    def refuse(requested: zenoh.Query) -> None:
+        with requested:
+            requested.reply_err(refusal, encoding=JSON)
 
     session = router.session
-    declared = [session.declare_queryable(key, answer(key, *told)) for key, told in everything().items()]
+    declared = [session.declare_queryable(key, answer(key, *reported)) for key, reported in everything().items()]
     refusing = session.declare_queryable(f"{REFUSING.root}/**", refuse)
     token = session.liveliness().declare_token(KEYS.alive(HOSTILE))
     yield router.endpoint
@@ -142,10 +142,10 @@ def harmless(outcome: Outcome, *, styled: bool = False) -> str:
 @pytest.mark.fault("control sequences in every text of every reply", "the terminal shows them as escapes")
 @pytest.mark.parametrize("key", QUERIES)
 def test_a_reply_steers_no_terminal(coec: Coec, vehicle: str, styled: bool, key: str) -> None:
-    asked = ("query", key, "--vehicle", KEYS.vehicle, "--connect", vehicle, "--pair", "front")
-    shown = harmless(coec(*asked), styled=styled)
+    requested = ("query", key, "--vehicle", KEYS.vehicle, "--connect", vehicle, "--pair", "front")
+    shown = harmless(coec(*requested), styled=styled)
     assert r"\x1b[35;45m" in shown or r"\u001b[35;45m" in shown, "what was sent is shown"
-    document = coec(*asked, "--json")
+    document = coec(*requested, "--json")
     assert obeyed_characters(document.out) == ""
     if key != "metrics":
         assert document.out.count("\n") == 1
@@ -154,7 +154,7 @@ def test_a_reply_steers_no_terminal(coec: Coec, vehicle: str, styled: bool, key:
 
 @pytest.mark.parametrize("choice", [0, 1])
 @pytest.mark.parametrize("kind", replies.BY_KIND)
-def test_whatever_fixed_words_a_reply_has_it_steers_no_terminal(
+def test_whatever_fixed_text_a_reply_has_it_steers_no_terminal(
     capsys: pytest.CaptureFixture[str], styled: bool, kind: str, choice: int
 ) -> None:
     replies.BY_KIND[kind](message.to_json(hostile_message(MODELS[kind], choice)))
@@ -166,14 +166,14 @@ def test_whatever_fixed_words_a_reply_has_it_steers_no_terminal(
 @pytest.mark.fault("control sequences in code and message of an error reply", "one line with escapes, and a document")
 @pytest.mark.parametrize("key", QUERIES)
 def test_a_refusal_steers_no_terminal(coec: Coec, vehicle: str, key: str) -> None:
-    asked = ("query", key, "--vehicle", REFUSING.vehicle, "--connect", vehicle, "--pair", "front")
-    outcome = coec(*asked)
+    requested = ("query", key, "--vehicle", REFUSING.vehicle, "--connect", vehicle, "--pair", "front")
+    outcome = coec(*requested)
     assert outcome.status == RemoteError.exit_code
     assert r"\x1b[35;45m" in harmless(outcome)
     assert outcome.err.count("\n") == 1, "a message makes no second line"
-    told = coec(*asked, "--json")
-    assert obeyed_characters(told.out) == ""
-    assert told.document["error"]["code"] == HOSTILE
+    reported = coec(*requested, "--json")
+    assert obeyed_characters(reported.out) == ""
+    assert reported.document["error"]["code"] == HOSTILE
 
 
 @pytest.mark.fault("control sequences in samples and tokens that are watched", "lines and board show them as escapes")
@@ -285,14 +285,14 @@ def test_a_reply_that_is_no_json_is_an_error(
 ) -> None:
     keys = Keys("coec", "broken")
 
-    def answer(asked: zenoh.Query) -> None:
-        with asked:
-            asked.reply(asked.key_expr, payload, encoding=JSON)
+    def answer(requested: zenoh.Query) -> None:
+        with requested:
+            requested.reply(requested.key_expr, payload, encoding=JSON)
 
     declared = router.session.declare_queryable(f"{keys.root}/**", answer)
     try:
-        asked = ("--vehicle", keys.vehicle, "--connect", router.endpoint, "--pair", "front", *as_json)
-        outcomes = {key: coec("query", key, *asked) for key in ("config", "command/hold", "health")}
+        requested = ("--vehicle", keys.vehicle, "--connect", router.endpoint, "--pair", "front", *as_json)
+        outcomes = {key: coec("query", key, *requested) for key in ("config", "command/hold", "health")}
     finally:
         declared.undeclare()
     for outcome in outcomes.values():

@@ -21,17 +21,17 @@ needs_search = pytest.mark.skipif(not HAS_SEARCH, reason="needs the optional ext
 
 @needs_search
 @pytest.mark.fault("a LiDAR is knocked by 1°", "the edge to another LiDAR shows it, with its size")
-def test_a_knocked_lidar_is_told_by_its_size(coec: Coec, record_property: Callable[[str, object], None]) -> None:
+def test_a_displaced_lidar_is_reported_by_its_size(coec: Coec, record_property: Callable[[str, object], None]) -> None:
     outcome = coec("lidars", f"{RIG}&faults=near_left:step:0:rz=1", "roof", "near_left", "--pairs", 4, "--json")
     assert outcome.status == 0, outcome.err
-    told = outcome.document
-    found_deg = float(np.linalg.norm(told["correction"][:3]))
-    record_property("figure", f"{found_deg:.2f}°")
-    assert found_deg == pytest.approx(1.0, abs=0.15)
-    assert np.abs(np.array(told["error"]) / told["sigma"]).max() < 4.0
-    assert np.abs(told["error"][:3]).max() < 0.15
-    assert found_deg > 6.0 * max(told["sigma"][:3])
-    assert told["reasons"] == []
+    reported = outcome.document
+    result_deg = float(np.linalg.norm(reported["correction"][:3]))
+    record_property("figure", f"{result_deg:.2f}°")
+    assert result_deg == pytest.approx(1.0, abs=0.15)
+    assert np.abs(np.array(reported["error"]) / reported["sigma"]).max() < 4.0
+    assert np.abs(reported["error"][:3]).max() < 0.15
+    assert result_deg > 6.0 * max(reported["sigma"][:3])
+    assert reported["reasons"] == []
 
 
 @needs_search
@@ -45,17 +45,17 @@ def test_lidars_that_see_nothing_in_common_say_so(coec: Coec) -> None:
 
 @needs_search
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ((RIG, "roof", "roof"), "name two LiDARs"),
         ((RIG, "roof", "front"), "no LiDAR front; it has roof, near_left, near_right"),
         ((f"{RIG}&pair=front-roof", "roof", "near_left"), "without `pair`"),
     ],
 )
-def test_what_does_not_fit_is_refused(coec: Coec, arguments: tuple[str, ...], said: str) -> None:
+def test_what_does_not_fit_is_refused(coec: Coec, arguments: tuple[str, ...], message: str) -> None:
     outcome = coec("lidars", *arguments)
     assert outcome.status == 2
-    assert said in outcome.err
+    assert message in outcome.err
 
 
 @needs_search

@@ -69,7 +69,7 @@ def test_a_command_is_declared_without_the_others() -> None:
     }
 
 
-def test_a_mistyped_command_is_told_which_is_meant(coec: Coec) -> None:
+def test_a_mistyped_command_is_reported_which_is_meant(coec: Coec) -> None:
     outcome = coec("calibrat")
     assert outcome.status == 2
     assert "'calibrate'" in outcome.err
@@ -160,7 +160,7 @@ def test_a_shell_completes_commands_options_and_values(
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_the_script_of_a_shell_asks_this_program(coec: Coec, monkeypatch: pytest.MonkeyPatch, shell: str) -> None:
+def test_the_script_of_a_shell_requests_this_program(coec: Coec, monkeypatch: pytest.MonkeyPatch, shell: str) -> None:
     monkeypatch.setenv("_COEC_COMPLETE", f"source_{shell}")
     shown = coec()
     assert shown.status == 0

@@ -73,7 +73,7 @@ def test_adds_an_export_of_a_network_once_and_then_uses_it(coec: Coec, folder: P
     assert depth.identity == hashlib.sha256(file.read_bytes()).hexdigest()
 
 
-def test_another_file_in_its_place_is_replaced_only_if_asked(coec: Coec, folder: Path, tmp_path: Path) -> None:
+def test_another_file_in_its_place_is_replaced_only_on_request(coec: Coec, folder: Path, tmp_path: Path) -> None:
     file, place = tmp_path / "any.onnx", folder / "midas_small.onnx"
     file.write_bytes(first_channel_network())
     folder.mkdir(parents=True)
@@ -87,7 +87,7 @@ def test_another_file_in_its_place_is_replaced_only_if_asked(coec: Coec, folder:
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "more", "status", "said"),
+    ("name", "content", "more", "status", "reported"),
     [
         ("mine.onnx", first_channel_network(), (), 1, "docs/own-network.md"),
         ("mine.onnx", first_channel_network(), ("--as", "nosuch"), 2, "no built-in card of this name"),
@@ -106,14 +106,14 @@ def test_what_is_no_known_network_is_not_added(
     content: bytes | None,
     more: tuple[str, ...],
     status: int,
-    said: str,
+    reported: str,
 ) -> None:
     file = tmp_path / name
     if content is not None:
         file.write_bytes(content)
     outcome = coec("models", "add", file, *more)
     assert outcome.status == status
-    assert said in outcome.err
+    assert reported in outcome.err
     assert not folder.exists()
 
 
@@ -140,7 +140,7 @@ def test_unknown_file_has_no_card(coec: Coec, tmp_path: Path) -> None:
     assert "no model card" in outcome.err
 
 
-def test_other_words_are_a_usage_error(coec: Coec) -> None:
+def test_other_text_are_a_usage_error(coec: Coec) -> None:
     assert coec("models", "burn").status == 2
 
 
@@ -159,7 +159,7 @@ def test_assesses_a_network_against_the_lidar(coec: Coec, tmp_path: Path) -> Non
         assert (tmp_path / "out" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_assessment_in_words(coec: Coec) -> None:
+def test_assessment_as_text(coec: Coec) -> None:
     outcome = coec("models", "assess", "stereo", SMALL, "--frames", "2")
     assert "good: plain mutual information finds the calibration with it" in outcome.out
     assert "rank correlation with inverse range" in outcome.out

@@ -31,7 +31,7 @@ def written(stream: io.TextIOWrapper) -> str:
     return stream.buffer.getvalue().decode("ascii")
 
 
-def test_signs_become_words_in_ascii(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_signs_become_text_in_ascii(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = ascii_stream()
     monkeypatch.setattr(sys, "stdout", stream)
     formatting.never_fail()
@@ -57,7 +57,7 @@ def test_a_sign_without_a_word_is_a_mark(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.parametrize("environment", [{"NO_COLOR": "1"}, {"TERM": "dumb"}, {"TERM": "dumb", "FORCE_COLOR": "1"}])
-def test_where_it_is_asked_for_nothing_but_text_is_sent(
+def test_where_it_is_requested_nothing_but_text_is_sent(
     environment: Mapping[str, str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("NO_COLOR", "TERM", "FORCE_COLOR"):
@@ -84,9 +84,9 @@ def test_help_of_everything_is_plain_where_the_locale_is_ascii() -> None:
         "    main()\n"
     )
     names = (*BUILT_IN, *(point.name for point in entry_points(group=extensions.COMMANDS)))
-    words = [[], *(name.split(".") for name in names), ["sim", "drive"], ["sim", "matrix"]]
+    text = [[], *(name.split(".") for name in names), ["sim", "drive"], ["sim", "matrix"]]
     environment = {"PYTHONPATH": ":".join(sys.path), "PYTHONIOENCODING": "ascii", "TERM": "dumb", "PATH": os.defpath}
-    done = subprocess.run([sys.executable, "-c", code, repr(words)], capture_output=True, env=environment)
+    done = subprocess.run([sys.executable, "-c", code, repr(text)], capture_output=True, env=environment)
     assert done.returncode == 0, done.stderr.decode()
     assert done.stdout.isascii()
     assert b"185deg" in done.stdout

@@ -44,11 +44,11 @@ class Listener:
         self.samples: defaultdict[str, list[zenoh.Sample]] = defaultdict(list)
         self.tokens: set[str] = set()
         self._open = [
-            session.declare_subscriber("**", zenoh.handlers.Callback(self._hear, indirect=False)),
+            session.declare_subscriber("**", zenoh.handlers.Callback(self._receive, indirect=False)),
             session.liveliness().declare_subscriber("@ros2_lv/**", zenoh.handlers.Callback(self._note, indirect=False)),
         ]
 
-    def _hear(self, sample: zenoh.Sample) -> None:
+    def _receive(self, sample: zenoh.Sample) -> None:
         self.take(sample)
 
     def take(self, sample: zenoh.Sample) -> None:
@@ -58,8 +58,8 @@ class Listener:
         self.tokens.add(str(sample.key_expr))
 
     def attachments(self, key: str) -> list[MessageAttachment]:
-        told = [MessageAttachment.parse(s.attachment.to_bytes()) for s in self.samples[key] if s.attachment]
-        return [attachment for attachment in told if attachment is not None]
+        reported = [MessageAttachment.parse(s.attachment.to_bytes()) for s in self.samples[key] if s.attachment]
+        return [attachment for attachment in reported if attachment is not None]
 
     def count(self) -> int:
         return sum(map(len, self.samples.values()))
@@ -80,10 +80,10 @@ def recorded(drive: list[tuple[str, Any]], topic: str) -> list[bytes]:
 
 
 def played(coec: Coec, listener: Listener, source: object, *options: object) -> Any:
-    told = coec("play", source, *options, "--rate", 0, "--connect", listener.endpoint, "--json")
-    assert told.status == 0, told.err
-    wait_until(lambda: listener.count() == sum(told.document["frames"].values()), "every message", SECONDS)
-    return told.document
+    reported = coec("play", source, *options, "--rate", 0, "--connect", listener.endpoint, "--json")
+    assert reported.status == 0, reported.err
+    wait_until(lambda: listener.count() == sum(reported.document["frames"].values()), "every message", SECONDS)
+    return reported.document
 
 
 def test_a_bag_keeps_its_topics_types_and_bytes_on_the_keys_of_rmw_zenoh(
@@ -99,9 +99,11 @@ def test_a_bag_keeps_its_topics_types_and_bytes_on_the_keys_of_rmw_zenoh(
     assert listener.payloads(IMAGE_KEY) == recorded(drive, "/front/image")
     (token,) = (token for token in listener.tokens if "%front%image/" in token)
     assert token.split("/")[5:10] == ["MP", "%", "%", "coec_play", "%front%image"]
-    told = listener.attachments(IMAGE_KEY)
-    assert [attachment.sequence for attachment in told] == [1, 2, 3, 4]
-    assert {attachment.gid for attachment in told} == {xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")}
+    reported = listener.attachments(IMAGE_KEY)
+    assert [attachment.sequence for attachment in reported] == [1, 2, 3, 4]
+    assert {attachment.gid for attachment in reported} == {
+        xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
+    }
     wait_until(lambda: not list(listener.session.liveliness().get("@ros2_lv/**")), "tokens are withdrawn", SECONDS)
 
 
@@ -121,16 +123,16 @@ def test_a_bag_on_the_keys_of_a_bridge(coec: Coec, listener: Listener, tmp_path:
     assert all(sample.attachment is None for sample in listener.samples["shuttle/points"])
 
 
-def test_topics_are_chosen_by_name(coec: Coec, listener: Listener, tmp_path: Path) -> None:
+def test_topics_are_selected_by_name(coec: Coec, listener: Listener, tmp_path: Path) -> None:
     bag = Bag(drive_messages()).write(tmp_path / "b.mcap")
     document = played(coec, listener, bag, "--middleware", "ros2dds", "--topics", "/points,/odom")
     assert set(document["frames"]) == {"/points", "/odom"}
-    said = coec("play", bag, "--middleware", "ros2dds", "--topics", "/lidar", "--connect", listener.endpoint)
-    assert said.status == 2
-    assert "no topic /lidar; there: /front/camera_info (sensor_msgs/msg/CameraInfo, 1 message)" in said.err
+    message = coec("play", bag, "--middleware", "ros2dds", "--topics", "/lidar", "--connect", listener.endpoint)
+    assert message.status == 2
+    assert "no topic /lidar; there: /front/camera_info (sensor_msgs/msg/CameraInfo, 1 message)" in message.err
 
 
-def test_stamps_begin_now_where_asked_and_all_else_is_as_recorded(
+def test_stamps_begin_now_where_requested_and_all_else_is_as_recorded(
     coec: Coec, listener: Listener, tmp_path: Path
 ) -> None:
     drive = drive_messages()
@@ -145,7 +147,7 @@ def test_stamps_begin_now_where_asked_and_all_else_is_as_recorded(
     assert 0 < listener.attachments(IMAGE_KEY)[0].source_ns - began_ns < SECONDS * 10**9
 
 
-def test_a_loop_goes_on_in_time_until_it_is_told_to_stop(
+def test_a_loop_goes_on_in_time_until_it_is_stopped(
     coec: Coec, listener: Listener, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drive = drive_messages()
@@ -158,8 +160,8 @@ def test_a_loop_goes_on_in_time_until_it_is_told_to_stop(
 
     monkeypatch.setattr(listener, "take", counted)
     bag = Bag(drive).write(tmp_path / "b.mcap")
-    told = coec("play", bag, "--middleware", "ros2dds", "--loop", "--rate", 0, "--connect", listener.endpoint)
-    assert told.status == 0, told.err
+    reported = coec("play", bag, "--middleware", "ros2dds", "--loop", "--rate", 0, "--connect", listener.endpoint)
+    assert reported.status == 0, reported.err
     payloads = listener.payloads("front/image")
     assert payloads[:4] == recorded(drive, "/front/image")
     stamps = [decode("sensor_msgs/msg/CompressedImage", payload, LimitsConfig()).stamp_ns for payload in payloads]
@@ -177,11 +179,11 @@ def test_types_that_are_not_ros_own_have_no_key_of_rmw_zenoh(coec: Coec, listene
             schema = writer.register_schema(type_name, "ros2msg", b"int32 data")
             writer.add_message(writer.register_channel(topic, "cdr", schema), 5, b"\0\1\0\0anything", 5)
         writer.finish()  # type: ignore[no-untyped-call]
-    told = coec("play", bag, "--middleware", "rmw_zenoh", "--rate", 0, "--connect", listener.endpoint, "--json")
-    assert told.document["frames"] == {"/word": 1}
-    assert "hash is not known: '/wheels' ('acme_msgs/msg/Wheels')" in told.err
-    told = coec("play", bag, "--middleware", "rmw_zenoh", "--topics", "/wheels", "--connect", listener.endpoint)
-    assert told.status == 2
+    reported = coec("play", bag, "--middleware", "rmw_zenoh", "--rate", 0, "--connect", listener.endpoint, "--json")
+    assert reported.document["frames"] == {"/word": 1}
+    assert "hash is not known: '/wheels' ('acme_msgs/msg/Wheels')" in reported.err
+    reported = coec("play", bag, "--middleware", "rmw_zenoh", "--topics", "/wheels", "--connect", listener.endpoint)
+    assert reported.status == 2
     listener.samples.clear()
     document = played(coec, listener, bag, "--middleware", "ros2dds", "--start-now")
     assert document["frames"] == {"/wheels": 1, "/word": 1}
@@ -192,10 +194,10 @@ def test_types_that_are_not_ros_own_have_no_key_of_rmw_zenoh(coec: Coec, listene
 @pytest.mark.parametrize("topic", ["/**", "/a/*/b", "a", "/", "//a", "/a$b", "/a\x1b[2J", "/" + 300 * "a", "/@ros2_lv"])
 def test_names_that_are_none_are_left_out(coec: Coec, listener: Listener, tmp_path: Path, topic: str) -> None:
     bag = Bag([*drive_messages(), (topic, drive_messages()[1][1])]).write(tmp_path / "b.mcap")
-    told = coec("play", bag, "--middleware", "ros2dds", "--rate", 0, "--connect", listener.endpoint, "--json")
-    assert told.status == 0, told.err
-    assert len(told.document["frames"]) == 5
-    assert ascii(topic) in told.err.replace("\n", "")
+    reported = coec("play", bag, "--middleware", "ros2dds", "--rate", 0, "--connect", listener.endpoint, "--json")
+    assert reported.status == 0, reported.err
+    assert len(reported.document["frames"]) == 5
+    assert ascii(topic) in reported.err.replace("\n", "")
 
 
 def test_other_recordings_are_played_below_the_name_of_their_pair(coec: Coec, listener: Listener) -> None:
@@ -233,13 +235,13 @@ def test_all_sensors_of_a_rig_are_played_on_topics_of_their_own(coec: Coec, list
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (("--topics", "/points"), "add --middleware"),
         (("--middleware", "ros2dds", "--encoding", "cdr"), "topics of ROS 2 carry CDR"),
     ],
 )
-def test_options_that_do_not_go_together_are_refused(coec: Coec, tmp_path: Path, options: Any, said: str) -> None:
-    told = coec("play", Bag(drive_messages()).write(tmp_path / "b.mcap"), *options)
-    assert told.status == 2
-    assert said in told.err
+def test_options_that_do_not_go_together_are_refused(coec: Coec, tmp_path: Path, options: Any, message: str) -> None:
+    reported = coec("play", Bag(drive_messages()).write(tmp_path / "b.mcap"), *options)
+    assert reported.status == 2
+    assert message in reported.err

@@ -25,8 +25,8 @@ def test_the_command_line_proves_who_it_is(authority: TestAuthority, coec: Coec,
         open_session(ZenohConfig(connect=(endpoint,)), VEHICLE_LIMITS) as client,
     ):
         wait_until(lambda: bool(list(client.get(KEYS.status, timeout=20.0))), "the vehicle answers")
-        told = coec("query", "command/hold", *operator, "--json")
-        assert (told.status, told.document["code"]) == (0, "held")
+        reported = coec("query", "command/hold", *operator, "--json")
+        assert (reported.status, reported.document["code"]) == (0, "held")
         assert there.is_held
         for arguments in (
             ("command/reset", *operator),

@@ -103,12 +103,12 @@ def test_ten_lines_calibrate_and_export(
 
 
 # ------------------------------------------------------------------------------------------------- recordings
-def test_a_recording_tells_what_it_holds(drive: package.Recording) -> None:
+def test_a_recording_reports_what_it_holds(drive: package.Recording) -> None:
     assert_type(drive, package.Recording)
-    told = drive.describe()
-    assert (told.pair, told.camera.frames, told.lidar.frames) == ("sim", 6, 6)
-    assert told.camera.rate_hz == pytest.approx(0.5)
-    assert (told.intrinsics["width"], told.camera_model) == (160, "double_sphere")
+    reported = drive.describe()
+    assert (reported.pair, reported.camera.frames, reported.lidar.frames) == ("sim", 6, 6)
+    assert reported.camera.rate_hz == pytest.approx(0.5)
+    assert (reported.intrinsics["width"], reported.camera_model) == (160, "double_sphere")
     assert drive.T_camera_lidar.shape == (4, 4)
     drive.T_camera_lidar[:] = 0.0
     assert drive.T_camera_lidar.any()
@@ -143,7 +143,7 @@ def test_a_slice_without_frames_says_so(drive: package.Recording) -> None:
 
 # --------------------------------------------------------------------------------- the same as the command line
 def test_calibrate_says_what_the_command_says_to_the_byte(coec: Coec, drive: package.Recording) -> None:
-    said = coec(
+    message = coec(
         "calibrate", SMALL, "--depth", "stereo", "--objective", "mi", "--perturb", "-2,1.5,1", "--camera-model",
         "double_sphere", "--frames", "5", "--time-offset", "--no-motion-compensation", "--json",
     ).document  # fmt: skip
@@ -158,14 +158,14 @@ def test_calibrate_says_what_the_command_says_to_the_byte(coec: Coec, drive: pac
         motion_compensation=False,
         progress=lambda stage, *_: stages.append(stage),
     )
-    said_fit, said_offset = said.pop("camera_fit"), said.pop("time_offset")
+    reported_fit, reported_offset = message.pop("camera_fit"), message.pop("time_offset")
     assert {"prepare", "depth", "search", "diagnosis", "time offset"} <= set(stages)
-    assert set(said.pop("elapsed_s")) == {*stages, "load", "total"}
-    assert result.to_json().encode() == to_json(CalibrationResult.model_validate(said))
+    assert set(message.pop("elapsed_s")) == {*stages, "load", "total"}
+    assert result.to_json().encode() == to_json(CalibrationResult.model_validate(message))
     assert result.camera_fit is not None
-    assert said_fit["residual_max_px"] == result.camera_fit.residual_max_px
+    assert reported_fit["residual_max_px"] == result.camera_fit.residual_max_px
     assert result.time_offset is not None
-    assert said_offset["reason"] == result.time_offset.reason
+    assert reported_offset["reason"] == result.time_offset.reason
 
 
 def test_a_recorded_window_is_calibrated_as_it_was_recorded(
@@ -178,19 +178,19 @@ def test_a_recorded_window_is_calibrated_as_it_was_recorded(
     for pair in window.pairs:
         writer.add(pair)
     writer.finish()
-    said = coec("calibrate", path, "--json").document
-    said.pop("elapsed_s")
+    message = coec("calibrate", path, "--json").document
+    message.pop("elapsed_s")
     opened = package.open(path)
     result = opened.calibrate()
     assert opened.configuration == recorded
     assert result.configuration == recorded
-    assert result.to_json().encode() == to_json(CalibrationResult.model_validate(said))
+    assert result.to_json().encode() == to_json(CalibrationResult.model_validate(message))
     other = opened.calibrate(configuration=CalibrationConfig(depth=DepthConfig(model="stereo")), objective="mi")
     assert other.document.config_hash != result.document.config_hash
 
 
 def test_evaluate_says_what_the_command_says(coec: Coec, drive: package.Recording) -> None:
-    said = coec(
+    message = coec(
         "evaluate",
         SMALL,
         "--depth",
@@ -205,7 +205,7 @@ def test_evaluate_says_what_the_command_says(coec: Coec, drive: package.Recordin
     ).document
     report = package.evaluate(drive, rotation_deg=3.0, directions=2, depth="stereo", objective="mi")
     timed = {"elapsed_s", "solve_s"}
-    expected = EvaluationReport.model_validate(said)
+    expected = EvaluationReport.model_validate(message)
     assert report.model_dump(exclude=timed) == expected.model_dump(exclude=timed)
     with pytest.raises(UsageError, match="directions"):
         package.evaluate(drive, rotation_deg=3.0, directions=0)
@@ -246,8 +246,8 @@ def test_an_export_is_the_one_of_the_command(coec: Coec, right: package.Result, 
     pose = np.eye(4)
     pose[:3, 3] = (1.0, 2.0, 3.0)
     written = right.export(tmp_path / "new" / "tf.py", format="tf", parent="base_link", T_parent_lidar=pose)
-    said = coec("export", document, "--format", "tf", "--parent", "base_link", "--parent-pose", "1,2,3,0,0,0,1").out
-    assert written.read_text() == said
+    message = coec("export", document, "--format", "tf", "--parent", "base_link", "--parent-pose", "1,2,3,0,0,0,1").out
+    assert written.read_text() == message
 
 
 def test_what_cannot_be_exported_says_why(right: package.Result, tmp_path: Path) -> None:
@@ -263,11 +263,11 @@ def test_what_cannot_be_exported_says_why(right: package.Result, tmp_path: Path)
 
 
 def test_overlays_differ_where_the_poses_do(right: package.Result) -> None:
-    found, start, nominal = right.overlay(), right.overlay("start"), right.overlay("nominal")
-    assert found.dtype == np.uint8
-    assert found.shape == start.shape == nominal.shape
-    assert found.shape[2] == 3
-    assert not np.array_equal(found, start)
+    detected, start, nominal = right.overlay(), right.overlay("start"), right.overlay("nominal")
+    assert detected.dtype == np.uint8
+    assert detected.shape == start.shape == nominal.shape
+    assert detected.shape[2] == 3
+    assert not np.array_equal(detected, start)
     with pytest.raises(UsageError, match="known are result, start, nominal"):
         right.overlay("end")  # type: ignore[arg-type]
 

@@ -85,8 +85,8 @@ def serve_status(bus: Bus, *pairs: str) -> None:
 
 def window_routes(key: str) -> Sequence[Route]:
     def answer(parameters: str) -> Answer:
-        chosen = parse_range_selector(parameters)
-        return Answer(WINDOW[chosen.offset : chosen.offset + chosen.length], "application/octet-stream")
+        selected = parse_range_selector(parameters)
+        return Answer(WINDOW[selected.offset : selected.offset + selected.length], "application/octet-stream")
 
     return [Route(key, lambda request: answer(request.parameters), QueryLane.FILES)]
 
@@ -110,7 +110,7 @@ def no_event(_: str) -> Sequence[Route]:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "reported"),
     [
         (("windows/a//b", "--output", "w.mcap"), "'windows/a//b' is no key: empty chunks"),
         (("windows/", "--output", "w.mcap"), "empty chunks"),
@@ -145,17 +145,17 @@ def test_what_is_no_question_is_a_usage_error_and_writes_nothing(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     arguments: tuple[str, ...],
-    said: str,
+    reported: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     outcome = coec("query", *arguments, "--connect", vehicle)
     assert outcome.status == 2
-    assert said in outcome.err
+    assert reported in outcome.err
     assert "Traceback" not in outcome.err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_configuration_of_a_service_says_where_it_is_asked(
+def test_the_configuration_of_a_service_reports_where_it_is_requested(
     coec: Coec, vehicle: str, endpoint: str, tmp_path: Path
 ) -> None:
     shipped = (REPOSITORY / "deploy" / "coec.yaml").read_text()
@@ -196,7 +196,7 @@ def test_a_router_without_a_service_says_what_to_check(coec: Coec, endpoint: str
     assert "nobody answered coec/@v1/vehicle/*/health: check that `coec run` is up" in outcome.err
 
 
-def test_the_list_says_what_a_window_is_kept_for_and_names_snippets(coec: Coec, vehicle: str) -> None:
+def test_the_list_reports_what_a_window_is_retained_for_and_names_snippets(coec: Coec, vehicle: str) -> None:
     outcome = coec("query", "windows", "--connect", vehicle)
     assert "vehicle/front  1 window, 1 snippet" in outcome.out
     (window,) = (line for line in outcome.out.splitlines() if "front-1" in line)
@@ -215,7 +215,7 @@ def test_a_window_or_snippet_is_downloaded_and_verified(coec: Coec, vehicle: str
 
 
 @pytest.mark.parametrize(
-    ("key", "said"),
+    ("key", "reported"),
     [
         ("windows/nosuch", "pair front has no window nosuch: see `coec query windows`"),
         ("windows/front-2", "pair front has no window front-2"),
@@ -225,12 +225,12 @@ def test_a_window_or_snippet_is_downloaded_and_verified(coec: Coec, vehicle: str
     ],
 )
 def test_what_the_service_does_not_have_is_what_it_answered(
-    coec: Coec, vehicle: str, tmp_path: Path, key: str, said: str
+    coec: Coec, vehicle: str, tmp_path: Path, key: str, reported: str
 ) -> None:
     outcome = coec("query", key, "--output", tmp_path / "x", "--connect", vehicle, "--json")
     assert outcome.status == 1
     assert outcome.document["error"]["code"] == "not_found"
-    assert said in outcome.err
+    assert reported in outcome.err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -243,7 +243,7 @@ def test_a_command_says_how_long_its_sender_waits(coec: Coec, vehicle: str, key:
     assert parse_command_selector(given.document["text"]).timeout_ms == 7
 
 
-def test_a_command_tells_who_says_that_he_gives_it(coec: Coec, vehicle: str) -> None:
+def test_a_command_reports_who_reports_that_he_gives_it(coec: Coec, vehicle: str) -> None:
     CLAIMS.clear()
     assert coec("query", "command/hold", "--connect", vehicle).status == 0
     assert coec("query", "health", "--connect", vehicle).status == 1
@@ -251,16 +251,16 @@ def test_a_command_tells_who_says_that_he_gives_it(coec: Coec, vehicle: str) -> 
     assert claim == f"{getpass.getuser()}@{socket.gethostname()}".encode()
 
 
-def test_a_file_that_holds_something_else_is_replaced_only_if_asked(coec: Coec, vehicle: str, tmp_path: Path) -> None:
+def test_a_file_that_holds_something_else_is_replaced_only_on_request(coec: Coec, vehicle: str, tmp_path: Path) -> None:
     path = tmp_path / "w.mcap"
     path.write_bytes(b"another recording")
-    words = ("query", "windows/front-7.snippet", "--output", path, "--connect", vehicle)
-    refused = coec(*words)
+    labels = ("query", "windows/front-7.snippet", "--output", path, "--connect", vehicle)
+    refused = coec(*labels)
     assert refused.status == 1
     assert f"{path} is there already" in refused.err
     assert path.read_bytes() == b"another recording"
-    assert coec(*words, "--force").status == 0
-    assert coec(*words).status == 0, "what is complete is not fetched again"
+    assert coec(*labels, "--force").status == 0
+    assert coec(*labels).status == 0, "what is complete is not fetched again"
 
 
 def test_of_several_pairs_one_has_to_be_named(coec: Coec, endpoint: str, tmp_path: Path) -> None:
@@ -315,8 +315,8 @@ def test_options_stand_for_the_entries_of_a_payload(
 ) -> None:
     PAYLOADS.clear()
     assert coec("query", *typed, "--connect", vehicle).status == 0
-    ((asked, sent),) = PAYLOADS
-    assert asked == key
+    ((requested, sent),) = PAYLOADS
+    assert requested == key
     assert json.loads(sent) == payload
 
 
@@ -329,8 +329,8 @@ def test_every_entry_of_a_payload_has_its_option() -> None:
 
 def test_the_help_text_has_every_key_with_what_it_answers(coec: Coec) -> None:
     shown = coec("query", "--help").out
-    asked = (*PLAIN_KEYS, *(f"{name}/{what}" for name, what in WITH_ARGUMENT.items()))
-    assert {each.key for each in HELPED} == set(asked)
+    requested = (*PLAIN_KEYS, *(f"{name}/{what}" for name, what in WITH_ARGUMENT.items()))
+    assert {each.key for each in HELPED} == set(requested)
     for each in HELPED:
         assert each.key in shown
         assert each.answer in shown

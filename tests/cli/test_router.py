@@ -28,19 +28,19 @@ def listening(*endpoints: str) -> dict[str, object]:
     return {"endpoints": list(endpoints)}
 
 
-def test_it_routes_until_it_is_told_to_stop(coec: Coec, tmp_path: Path) -> None:
+def test_it_routes_until_it_is_stopped(coec: Coec, tmp_path: Path) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    heard: list[str] = []
+    received: list[str] = []
 
     def use() -> None:
         with connected([endpoint], 20.0) as one, connected([endpoint], 20.0) as other:
-            subscriber = one.declare_subscriber("a/key", lambda sample: heard.append(sample.payload.to_string()))
+            subscriber = one.declare_subscriber("a/key", lambda sample: received.append(sample.payload.to_string()))
 
-            def said() -> bool:
+            def reported() -> bool:
                 other.put("a/key", "word")  # until the route is laid
-                return bool(heard)
+                return bool(received)
 
-            wait_until(said, "the word")
+            wait_until(reported, "the word")
             subscriber.undeclare()
         os.kill(os.getpid(), signal.SIGTERM)
 
@@ -49,9 +49,9 @@ def test_it_routes_until_it_is_told_to_stop(coec: Coec, tmp_path: Path) -> None:
     outcome = coec("router", "--config", written(tmp_path, listen=listening(endpoint)))
     client.join()
     assert outcome.status == 0
-    assert heard[0] == "word"
-    said = [json.loads(line)["message"] for line in outcome.out.splitlines()]
-    assert said == ["routing", "stopping"]
+    assert received[0] == "word"
+    reported = [json.loads(line)["message"] for line in outcome.out.splitlines()]
+    assert reported == ["routing", "stopping"]
 
 
 def test_a_file_that_is_no_routers_is_refused(coec: Coec, tmp_path: Path) -> None:

@@ -56,29 +56,29 @@ def viewing(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Outcom
     for name in ("view.vehicle.REPEAT_S", "view.vehicle.QUERY_S", "view.recording.AGAIN_S"):
         monkeypatch.setattr(f"coec.cli.{name}", OFTEN_S)
 
-    def run(look: Callable[[str], None], *arguments: object) -> Outcome:
+    def run(observation: Callable[[str], None], *arguments: object) -> Outcome:
         shown = console.print_json
-        with ThreadPoolExecutor(1) as beside:
-            looked: list[Any] = []
+        with ThreadPoolExecutor(1) as neighbour:
+            checked: list[Any] = []
 
             def print_json(document: Any) -> None:
                 shown(document)
-                looked.append(beside.submit(ended_by, look, document["url"]))
+                checked.append(neighbour.submit(finished_by, observation, document["url"]))
 
             monkeypatch.setattr(console, "print_json", print_json)
             outcome = coec("view", *arguments, "--listen", ANYWHERE, "--json")
-            for one in looked:
+            for one in checked:
                 one.result()
-        assert looked, outcome.err
+        assert checked, outcome.err
         return outcome
 
     return run
 
 
-def ended_by(look: Callable[[str], None], url: str) -> None:
+def finished_by(observation: Callable[[str], None], url: str) -> None:
     """Ctrl-C, when whoever looks has seen enough or has failed."""
     try:
-        look(url)
+        observation(url)
     finally:
         os.kill(os.getpid(), signal.SIGINT)
 
@@ -87,7 +87,7 @@ def stamp_ns(message: Any) -> int:
     return int(message.timestamp.seconds * 10**9 + message.timestamp.nanos)
 
 
-def came(message: Any) -> np.ndarray:
+def received(message: Any) -> np.ndarray:
     """Pixels, their centres at integers."""
     return np.array([(point.x - 0.5, point.y - 0.5) for band in message.points for point in band.points])
 
@@ -102,24 +102,24 @@ def take(stamps: list[int], viewer: Viewer) -> None:
         stamps.append(stamp)
 
 
-def synchronised(viewer: Viewer, wanted: set[str]) -> dict[str, Any]:
+def synchronised(viewer: Viewer, required: set[str]) -> dict[str, Any]:
     """Messages of one stamp, as viewers wait for them: whoever reads slowly misses some."""
     by_stamp: dict[int, dict[str, Any]] = {}
     while True:
         topic, message = viewer.next()
-        if topic in wanted:
-            found = by_stamp.setdefault(stamp_ns(message), {})
-            found[topic] = message
-            if set(found) == wanted:
-                return found
+        if topic in required:
+            result = by_stamp.setdefault(stamp_ns(message), {})
+            result[topic] = message
+            if set(result) == required:
+                return result
 
 
 def result_file(folder: Path, rig: Rig, T_camera_lidar: np.ndarray) -> Path:
     """As `coec calibrate --json` would have printed it."""
-    found = estimate(3)
-    found = replace(found, optimum=replace(found.optimum, T_camera_lidar=T_camera_lidar))
+    result = estimate(3)
+    result = replace(result, optimum=replace(result.optimum, T_camera_lidar=T_camera_lidar))
     path = folder / "result.json"
-    path.write_bytes(to_json(result_of(found, rig, "vehicle")))
+    path.write_bytes(to_json(result_of(result, rig, "vehicle")))
     return path
 
 
@@ -131,7 +131,7 @@ def test_a_recording_is_shown_and_stays_to_be_seen(viewing: Callable[..., Outcom
     xyz_m = compensate(last, rig, enabled=True)
     stamps: list[int] = []
 
-    def look(url: str) -> None:
+    def observation(url: str) -> None:
         with Viewer(url) as viewer:
             viewer.subscribe([viewer_scene.IMAGE_TOPIC, viewer_scene.HEALTH_TOPIC, *POINTS_TOPICS.values()])
             while len(stamps) < len(recording.camera_stamps_ns):
@@ -141,9 +141,9 @@ def test_a_recording_is_shown_and_stays_to_be_seen(viewing: Callable[..., Outcom
                 (DisplayedPose.SERVED, rig.T_camera_lidar_nominal), (DisplayedPose.NOMINAL, rig.T_camera_lidar_nominal),
                 (DisplayedPose.CANDIDATE, turned),
             ):  # fmt: skip
-                drawn = places(came(picture[POINTS_TOPICS[pose]]))
-                assert len(drawn) > 500
-                assert drawn <= places(projected(rig.camera, T_camera_lidar, xyz_m))
+                rendered = places(received(picture[POINTS_TOPICS[pose]]))
+                assert len(rendered) > 500
+                assert rendered <= places(projected(rig.camera, T_camera_lidar, xyz_m))
             moment = viewer.next_on(viewer_scene.HEALTH_TOPIC)
         assert (moment["state"], moment["status"], moment["candidate"]) == ("recorded", "accepted", True)
         assert moment["step"]["rx_deg"] == pytest.approx(3.0)
@@ -151,26 +151,26 @@ def test_a_recording_is_shown_and_stays_to_be_seen(viewing: Callable[..., Outcom
             late.subscribe([viewer_scene.IMAGE_TOPIC])
             assert stamp_ns(late.next_on(viewer_scene.IMAGE_TOPIC)) == stamps[-1], "who comes late sees the last pair"
 
-    outcome = viewing(look, SMALL, "--rate", "20", "--result", result_file(tmp_path, rig, turned))
+    outcome = viewing(observation, SMALL, "--rate", "20", "--result", result_file(tmp_path, rig, turned))
     assert outcome.status == 0
     assert stamps == list(recording.camera_stamps_ns)
-    told = outcome.document
-    assert set(told["topics"]) == set(TOPIC_DESCRIPTIONS)
-    assert told["frames"]["served"] == f"{rig.camera_frame}_served"
-    assert told["url"].startswith("ws://127.0.0.1:")
+    reported = outcome.document
+    assert set(reported["topics"]) == set(TOPIC_DESCRIPTIONS)
+    assert reported["frames"]["served"] == f"{rig.camera_frame}_served"
+    assert reported["url"].startswith("ws://127.0.0.1:")
 
 
 def test_a_recording_that_is_repeated_goes_on_in_time(viewing: Callable[..., Outcome]) -> None:
     stamps: list[int] = []
 
-    def look(url: str) -> None:
+    def observation(url: str) -> None:
         with Viewer(url) as viewer:
             viewer.subscribe([viewer_scene.IMAGE_TOPIC, viewer_scene.HEALTH_TOPIC])
             while len(stamps) < 9:
                 take(stamps, viewer)
             assert viewer.next_on(viewer_scene.HEALTH_TOPIC)["state"] == "recorded", "however fast it is played"
 
-    assert viewing(look, SMALL, "--rate", "100", "--repeat").status == 0
+    assert viewing(observation, SMALL, "--rate", "100", "--repeat").status == 0
     recorded = list(rendered_source(SMALL).camera_stamps_ns)
     assert len(recorded) == 6
     assert stamps[:6] == recorded
@@ -193,7 +193,7 @@ def until(viewer: Viewer, condition: Callable[[Any], bool], meanwhile: Callable[
 def test_a_vehicle_is_shown_while_its_service_comes_changes_and_goes(
     viewing: Callable[..., Outcome], router: Router, tmp_path: Path, record_property: Record
 ) -> None:
-    def look(url: str) -> None:
+    def observation(url: str) -> None:
         with Viewer(url) as viewer, Sensors(router.session) as sensors:
             viewer.subscribe([viewer_scene.HEALTH_TOPIC, viewer_scene.LOG_TOPIC])
             assert viewer.next_on(viewer_scene.HEALTH_TOPIC)["state"] == "not_served"
@@ -202,7 +202,7 @@ def test_a_vehicle_is_shown_while_its_service_comes_changes_and_goes(
             assert (moment["provenance"], moment["level"], moment["candidate"]) == ("estimated", 0, True)
             assert moment["correction"]["rx_deg"] == 2.0
             assert "camera_s" not in moment["ages"]
-            assert not sensors.are_heard, "nobody looks at pictures"
+            assert not sensors.are_received, "nobody looks at pictures"
 
             viewer.subscribe([viewer_scene.IMAGE_TOPIC, *POINTS_TOPICS.values()])
             picture = synchronised(viewer, {viewer_scene.IMAGE_TOPIC, *POINTS_TOPICS.values()})
@@ -213,9 +213,9 @@ def test_a_vehicle_is_shown_while_its_service_comes_changes_and_goes(
             }
             for pose, T_camera_lidar in expected.items():
                 marks = picture[POINTS_TOPICS[pose]]
-                assert places(came(marks)) == places(projected(RIG.camera, T_camera_lidar, PAIR.lidar.xyz_m))
+                assert places(received(marks)) == places(projected(RIG.camera, T_camera_lidar, PAIR.lidar.xyz_m))
             assert marks.texts[0].text == "candidate: waits for apply"
-            assert sensors.are_heard
+            assert sensors.are_received
             assert until(viewer, lambda moment: "camera_s" in moment["ages"])["ages"]["camera_s"] < 60.0
 
             service.say(KEYS.health("front"), health("miscalibrated"))
@@ -230,12 +230,12 @@ def test_a_vehicle_is_shown_while_its_service_comes_changes_and_goes(
             assert moment["provenance"] == "estimated", "the last that is known"
             while "not_served" not in viewer.next_on(POINTS_TOPICS[DisplayedPose.SERVED]).texts[0].text:
                 pass
-            wait_until(lambda: sensors.are_heard, "frames, still")
+            wait_until(lambda: sensors.are_received, "frames, still")
         with Viewer(url) as other, Sensors(router.session) as sensors:
             other.subscribe([viewer_scene.HEALTH_TOPIC])
-            wait_until(lambda: not sensors.are_heard, "the end of the subscriptions")
+            wait_until(lambda: not sensors.are_received, "the end of the subscriptions")
 
-    assert viewing(look, "--config", configuration(tmp_path, router.endpoint)).status == 0
+    assert viewing(observation, "--config", configuration(tmp_path, router.endpoint)).status == 0
 
 
 @pytest.mark.fault(
@@ -244,12 +244,12 @@ def test_a_vehicle_is_shown_while_its_service_comes_changes_and_goes(
 def test_rubbish_is_counted(
     viewing: Callable[..., Outcome], router: Router, tmp_path: Path, record_property: Record
 ) -> None:
-    def look(url: str) -> None:
+    def observation(url: str) -> None:
         service = Service(router.session)
         with Viewer(url) as viewer, Sensors(router.session) as sensors:
             viewer.subscribe([viewer_scene.HEALTH_TOPIC, viewer_scene.IMAGE_TOPIC])
             until(viewer, lambda moment: moment["state"] == "healthy")
-            wait_until(lambda: sensors.are_heard, "subscriptions")
+            wait_until(lambda: sensors.are_received, "subscriptions")
             key = KEYS.extrinsic("front")
             stranger = replace(PAIR.lidar, frame_id="elsewhere")
 
@@ -269,7 +269,7 @@ def test_rubbish_is_counted(
             record_property("figure", f"{len(refused)} causes")
         service.end()
 
-    assert viewing(look, "--config", configuration(tmp_path, router.endpoint)).status == 0
+    assert viewing(observation, "--config", configuration(tmp_path, router.endpoint)).status == 0
 
 
 def counted(moment: Any) -> set[tuple[str, str]]:
@@ -294,11 +294,11 @@ def test_other_computers_do_not_get_in_by_mistake(coec: Coec) -> None:
         ("--config", "coec.yaml", "--result", "result.json"),
     ],
 )
-def test_what_does_not_go_together_is_said(coec: Coec, arguments: tuple[str, ...]) -> None:
+def test_what_does_not_go_together_is_reported(coec: Coec, arguments: tuple[str, ...]) -> None:
     assert coec("view", *arguments).status == UsageError.exit_code
 
 
-def test_what_is_not_there_is_said(coec: Coec, tmp_path: Path, router: Router) -> None:
+def test_what_is_not_there_is_reported(coec: Coec, tmp_path: Path, router: Router) -> None:
     assert coec("view", tmp_path / "absent").status == SourceError.exit_code
     assert coec("view", "--config", tmp_path / "absent.yaml").status == ConfigError.exit_code
     rubbish = tmp_path / "result.json"

@@ -35,7 +35,7 @@ from support.scenes import BOARD_MOVED, BOARD_NOMINAL
 Record = Callable[[str, object], None]
 """pytest's `record_property`."""
 
-SAID = ServiceState(
+REPORTED = ServiceState(
     alive=True,
     answer_age_s=1.0,
     health=from_msgpack(HealthReply, health("miscalibrated")),
@@ -44,26 +44,26 @@ SAID = ServiceState(
 )
 
 
-def told(said: ServiceState) -> tuple[str, int, tuple[str, ...]]:
-    moment = moment_of_service("front", said, {}, Counter())
+def reported(message: ServiceState) -> tuple[str, int, tuple[str, ...]]:
+    moment = moment_of_service("front", message, {}, Counter())
     return moment.state, moment.level, moment.reasons
 
 
 def test_who_does_not_answer_is_silent_and_who_is_not_there_serves_nothing() -> None:
-    assert told(SAID) == ("miscalibrated", 2, ("moved",))
-    assert told(replace(SAID, answer_age_s=SILENT_S + 0.1)) == ("silent", 3, ("silent",))
-    assert told(replace(SAID, alive=False)) == ("not_served", 3, ("not_served",))
-    assert told(ServiceState(alive=True)) == ("silent", 3, ("silent",))
-    assert told(ServiceState()) == ("not_served", 3, ("not_served",))
+    assert reported(REPORTED) == ("miscalibrated", 2, ("moved",))
+    assert reported(replace(REPORTED, answer_age_s=SILENT_S + 0.1)) == ("silent", 3, ("silent",))
+    assert reported(replace(REPORTED, alive=False)) == ("not_served", 3, ("not_served",))
+    assert reported(ServiceState(alive=True)) == ("silent", 3, ("silent",))
+    assert reported(ServiceState()) == ("not_served", 3, ("not_served",))
 
 
-def test_what_is_not_known_is_not_drawn_and_says_so() -> None:
+def test_what_is_not_known_is_not_rendered_and_this_is_reported() -> None:
     nothing = extrinsics_of_service(RIG, ServiceState())
     assert nothing[DisplayedPose.SERVED].T_camera_lidar is None
     assert nothing[DisplayedPose.SERVED].title == "served: not known, not_served"
     np.testing.assert_array_equal(nothing[DisplayedPose.NOMINAL].T_camera_lidar, BOARD_NOMINAL)
     assert nothing[DisplayedPose.CANDIDATE].title == "candidate: none"
-    gone = extrinsics_of_service(RIG, replace(SAID, alive=False))
+    gone = extrinsics_of_service(RIG, replace(REPORTED, alive=False))
     assert gone[DisplayedPose.SERVED].T_camera_lidar is BOARD_MOVED, "the last that is known"
     assert gone[DisplayedPose.SERVED].title == "served: estimated, not_served"
 
@@ -98,7 +98,7 @@ def test_the_newest_pair_is_shown_and_older_ones_are_passed_over(
     record_property("figure", f"1 of {count} pairs, the newest")
 
 
-def test_keys_on_which_nothing_comes_are_told(
+def test_keys_on_which_nothing_comes_are_reported(
     router: Router, streams: SensorStreams, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert not streams.mute, "not at once"
@@ -118,7 +118,7 @@ def test_loopback_is_served_without_a_word(address: str, host: str) -> None:
 
 
 @pytest.mark.parametrize("address", ["0.0.0.0:8765", "[::]:8765", "10.0.0.5:8765", "vehicle.local:8765"])
-def test_other_addresses_are_served_only_if_that_is_said(address: str) -> None:
+def test_other_addresses_are_served_only_if_that_is_reported(address: str) -> None:
     with pytest.raises(UsageError, match="--insecure"):
         listen_address(address, insecure=False)
     assert listen_address(address, insecure=True).port == 8765

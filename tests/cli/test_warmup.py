@@ -21,14 +21,14 @@ from support.rigs import pair_config
 def test_kernels_that_are_there_are_not_compiled_again(capsys: pytest.CaptureFixture[str]) -> None:
     for _ in range(2):
         assert warmup.warmup(lenses=["pinhole"], as_json=True) == 0
-    told = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert (told["lenses"], told["kernels"], told["files_written"]) == (["pinhole"], compiled(1).total, 0)
-    assert Path(told["cache"]).is_dir()
+    reported = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert (reported["lenses"], reported["kernels"], reported["files_written"]) == (["pinhole"], compiled(1).total, 0)
+    assert Path(reported["cache"]).is_dir()
     reached = compiled(1)
     assert reached.done == reached.total
 
 
-def test_people_are_told_where_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+def test_people_are_reported_where_they_are(capsys: pytest.CaptureFixture[str]) -> None:
     assert warmup.warmup(lenses=["pinhole"]) == 0
     out = capsys.readouterr().out
     assert f"{compiled(1).total} kernels for pinhole" in out
@@ -36,7 +36,7 @@ def test_people_are_told_where_they_are(capsys: pytest.CaptureFixture[str]) -> N
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+def requested(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     """The lenses of every compilation, of which none is done."""
     seen: list[list[str]] = []
 
@@ -49,12 +49,12 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     return seen
 
 
-def test_by_default_it_compiles_for_every_lens_that_there_is(asked: list[list[str]]) -> None:
+def test_by_default_it_compiles_for_every_lens_that_there_is(requested: list[list[str]]) -> None:
     warmup.warmup()
-    assert asked == [list(MODELS)]
+    assert requested == [list(MODELS)]
 
 
-def test_it_compiles_for_the_lenses_of_a_configuration(tmp_path: Path, asked: list[list[str]]) -> None:
+def test_it_compiles_for_the_lenses_of_a_configuration(tmp_path: Path, requested: list[list[str]]) -> None:
     path = tmp_path / "coec.yaml"
     pair = pair_config("front")
     path.write_text(commented_yaml(Config(pairs=(pair,))))
@@ -62,19 +62,19 @@ def test_it_compiles_for_the_lenses_of_a_configuration(tmp_path: Path, asked: li
     path.write_text("middleware: rmw_zenoh\npairs: [{name: front, camera: /image, points: /points}]\n")
     warmup.warmup(config=path)
     assert pair.camera.intrinsics is not None
-    assert asked == [[pair.camera.intrinsics.model], list(MODELS)], "a lens that CameraInfo tells may be any"
+    assert requested == [[pair.camera.intrinsics.model], list(MODELS)], "a lens that CameraInfo tells may be any"
 
 
 @pytest.mark.parametrize("options", [{"lenses": ["fish"]}, {"lenses": ["mei"], "config": Path("coec.yaml")}])
-def test_it_refuses_an_unknown_lens_and_two_sources(options: dict[str, Any], asked: list[list[str]]) -> None:
+def test_it_refuses_an_unknown_lens_and_two_sources(options: dict[str, Any], requested: list[list[str]]) -> None:
     with pytest.raises(UsageError):
         warmup.warmup(**options)
-    assert asked == []
+    assert requested == []
 
 
 @pytest.mark.fault("no folder for compiled kernels can be written", "`coec warmup` says so, and compiles nothing")
-def test_without_a_cache_it_says_so(asked: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_cache_it_says_so(requested: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compiler, "kernel_cache", lambda: (Path("nowhere"), False))
     with pytest.raises(OutputError, match="XDG_CACHE_HOME"):
         warmup.warmup()
-    assert asked == []
+    assert requested == []

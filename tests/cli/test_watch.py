@@ -69,7 +69,7 @@ def speaker(router: Router) -> Iterator[Speaker]:
     speaker.end()
 
 
-def test_what_is_so_and_what_changes_is_told_a_document_a_line(
+def test_what_is_so_and_what_changes_is_reported_a_document_a_line(
     coec: Coec, router: Router, speaker: Speaker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown = console.print_json
@@ -83,9 +83,9 @@ def test_what_is_so_and_what_changes_is_told_a_document_a_line(
     monkeypatch.setattr(console, "print_json", print_json)
     outcome = coec("watch", "--connect", router.endpoint, "--seconds", AT_MOST_S, "--json")
     assert outcome.status == 0
-    told = [json.loads(line) for line in outcome.out.splitlines()]
-    assert {"key": KEYS.alive("front"), "value": True} in told
-    assert [one["value"]["state"] for one in told if one["key"] == KEY] == ["unknown", "degraded"]
+    reported = [json.loads(line) for line in outcome.out.splitlines()]
+    assert {"key": KEYS.alive("front"), "value": True} in reported
+    assert [one["value"]["state"] for one in reported if one["key"] == KEY] == ["unknown", "degraded"]
     assert "1 message was not shown" in outcome.err, "what is no document of ours is counted"
 
 

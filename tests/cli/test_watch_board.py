@@ -36,25 +36,25 @@ from support.router import MemoryStorage
 ALL = Keys("coec", "*")
 
 
-def say(session: zenoh.Session, vehicle: str, **told: Any) -> None:
+def say(session: zenoh.Session, vehicle: str, **reported: Any) -> None:
     key = Keys("coec", vehicle).last("front")
-    session.put(key, packed_heartbeat(heartbeat(vehicle, **told)), timestamp=session.new_timestamp())
+    session.put(key, packed_heartbeat(heartbeat(vehicle, **reported)), timestamp=session.new_timestamp())
 
 
-def test_what_was_kept_is_told_once_most_urgent_first(coec: Coec, router: Router) -> None:
+def test_what_was_retained_is_reported_once_most_urgent_first(coec: Coec, router: Router) -> None:
     with MemoryStorage(router.session, ALL.last("*")) as storage, connected([router.endpoint], 5.0) as vehicle:
         say(vehicle, "truck-1")
         say(vehicle, "truck-2", state="miscalibrated", event="front-7")
         say(vehicle, "truck-3", service="stopping")
         wait_until(lambda: len(storage.samples) == 3, "the words are kept")
         outcome = coec("watch", "--once", "--connect", router.endpoint, "--json")
-        told = [(pair["word"]["vehicle"], pair["standing"]) for pair in outcome.document["pairs"]]
-        assert told == [("truck-2", "silent"), ("truck-1", "silent"), ("truck-3", "parked")], "all long ago"
-        words = coec("watch", "--once", "--connect", router.endpoint, "--state", "parked", "--find", "truck")
-        assert words.status == 0
-        assert "3 vehicles, 3 pairs: 2 silent, 1 parked" in words.out
-        assert "parked (healthy)" in words.out
-        assert "truck-1" not in words.out
+        reported = [(pair["word"]["vehicle"], pair["standing"]) for pair in outcome.document["pairs"]]
+        assert reported == [("truck-2", "silent"), ("truck-1", "silent"), ("truck-3", "parked")], "all long ago"
+        labels = coec("watch", "--once", "--connect", router.endpoint, "--state", "parked", "--find", "truck")
+        assert labels.status == 0
+        assert "3 vehicles, 3 pairs: 2 silent, 1 parked" in labels.out
+        assert "parked (healthy)" in labels.out
+        assert "truck-1" not in labels.out
         one = coec("watch", "--once", "--vehicle", "truck-2", "--connect", router.endpoint, "--json")
         assert [pair["word"]["event"] for pair in one.document["pairs"]] == ["front-7"]
 
@@ -65,7 +65,7 @@ def test_a_fleet_that_says_nothing_is_a_failure(coec: Coec, router: Router) -> N
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("--once", "--lines"), "are about the board"),
         (("--state", "healthy"), "needs a terminal"),
@@ -73,11 +73,11 @@ def test_a_fleet_that_says_nothing_is_a_failure(coec: Coec, router: Router) -> N
     ],
 )
 def test_what_does_not_go_together_is_a_usage_error(
-    coec: Coec, router: Router, arguments: tuple[str, ...], said: str
+    coec: Coec, router: Router, arguments: tuple[str, ...], message: str
 ) -> None:
     outcome = coec("watch", *arguments, "--connect", router.endpoint)
     assert outcome.status == 2
-    assert said in outcome.err
+    assert message in outcome.err
 
 
 # ----------------------------------------------------------------------------------------------------- on a screen
@@ -86,9 +86,9 @@ def test_what_does_not_go_together_is_a_usage_error(
 @contextmanager
 def board_of(router: Router) -> Iterator[Board]:
     with connected([router.endpoint], 5.0) as session, connected([router.endpoint], 5.0) as of_tokens:
-        words = HeartbeatReceiver(session, of_tokens, ALL, 2.0)
-        with words.subscribed(), PairQuery(session, "coec") as asking:
-            yield Board(FleetState(), words, FleetFilter(), asking)
+        labels = HeartbeatReceiver(session, of_tokens, ALL, 2.0)
+        with labels.subscribed(), PairQuery(session, "coec") as asking:
+            yield Board(FleetState(), labels, FleetFilter(), asking)
 
 
 def text(board: Board) -> str:
@@ -98,7 +98,7 @@ def text(board: Board) -> str:
     return console.export_text()
 
 
-def test_keys_choose_a_pair_and_tell_its_reasons_history_and_overlay(router: Router) -> None:
+def test_keys_select_a_pair_and_report_its_reasons_history_and_overlay(router: Router) -> None:
     keys = Keys("coec", "truck-2")
     picture = encode_jpeg(np.full((90, 160, 3), 200, np.uint8))
     history = to_msgpack(HistoryReply(vehicle="truck-2", pair="front", total=0, results=()))
@@ -136,7 +136,7 @@ def test_keys_choose_a_pair_and_tell_its_reasons_history_and_overlay(router: Rou
 
 
 @pytest.mark.fault("a pair that does not answer what is asked of it", "the board goes on, and says so")
-def test_what_is_not_answered_is_said(router: Router) -> None:
+def test_what_is_not_answered_is_reported(router: Router) -> None:
     with connected([router.endpoint], 5.0) as vehicle, board_of(router) as board:
         say(vehicle, "truck-9")
         wait_until(lambda: "1 vehicle, 1 pair" in text(board), "it is told")
@@ -144,7 +144,7 @@ def test_what_is_not_answered_is_said(router: Router) -> None:
         wait_until(lambda: "no overlay of truck-9/front: nobody answered" in text(board), "nobody answers")
 
 
-def test_a_word_that_was_lost_is_asked_for(router: Router) -> None:
+def test_a_text_that_was_lost_is_requested(router: Router) -> None:
     """Of a pair that is overdue and has not taken its leave."""
     key = Keys("coec", "truck-5").last("front")
     now_s = 1000.0
@@ -169,7 +169,7 @@ def router_at(endpoint: str) -> Iterator[zenoh.Session]:
 
 
 @pytest.mark.fault("the link to the fleet's router breaks", "the board says so, ages go on, words come again with it")
-def test_a_link_that_breaks_is_said_and_words_come_again_with_it(
+def test_a_link_that_breaks_is_reported_and_text_come_again_with_it(
     record_property: Callable[[str, object], None],
 ) -> None:
     endpoint = free_endpoint()
@@ -184,11 +184,11 @@ def test_a_link_that_breaks_is_said_and_words_come_again_with_it(
         assert "silent (healthy)" in text(board), "its last state is not taken for the present one"
         board.clock = time.monotonic
         with router_at(endpoint) as session:
-            begun_s = time.monotonic()
+            started_s = time.monotonic()
             wait_until(lambda: board.heartbeats.is_connected, "the link is back")
             again = iter(range(1000))
             wait_until(lambda: _hears(board, session, next(again)), "a word comes again")
-            record_property("figure", f"{time.monotonic() - begun_s:.1f} s")
+            record_property("figure", f"{time.monotonic() - started_s:.1f} s")
 
 
 def _hears(board: Board, session: zenoh.Session, attempt: int) -> bool:
@@ -211,6 +211,6 @@ def test_keys_are_read_as_they_are_pressed(monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_picture_that_is_none_is_refused() -> None:
     with pytest.raises(DecodeError):
         fleet_board.half_block_text(b"\xff\xd8\xff not a picture", 80, 24)
-    drawn = fleet_board.half_block_text(encode_jpeg(np.zeros((100, 400, 3), np.uint8)), 80, 24).plain
-    rows = drawn.splitlines()
+    rendered = fleet_board.half_block_text(encode_jpeg(np.zeros((100, 400, 3), np.uint8)), 80, 24).plain
+    rows = rendered.splitlines()
     assert (len(rows), {len(row) for row in rows}) == (10, {80})

@@ -89,7 +89,7 @@ def test_replay_of_a_window_that_holds_a_knock_dates_it_by_the_same_pairs(coec: 
     back = se3.exp(np.array([0.0, -np.radians(2.0), 0.0, 0.0, 0.0, 0.0])).astype(np.float32)
     T = window.T_camera_lidar_start.astype(np.float32)
 
-    def knocked(pair: FramePair) -> FramePair:
+    def displaced(pair: FramePair) -> FramePair:
         """After the knock the sweep lies as if the camera had been turned by two degrees."""
         if pair.stamp_ns < knock_ns:
             return pair
@@ -102,7 +102,7 @@ def test_replay_of_a_window_that_holds_a_knock_dates_it_by_the_same_pairs(coec: 
     writer = WindowWriter(path, window.rig, start, window.window_id, configuration, {})
     for pair in sorted((*window.pairs, *window.between), key=lambda pair: pair.stamp_ns):
         add = writer.add_between if pair in window.between else writer.add
-        add(knocked(pair))
+        add(displaced(pair))
     writer.finish()
     read, _ = read_window(path)
     depth = open_depth(configuration.depth, LIMITS)

@@ -46,18 +46,18 @@ class Service:
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
-        self._said = {KEYS.health("front"): health("healthy"), KEYS.extrinsic("front"): extrinsic(BOARD_MOVED)}
-        self._queryables = [session.declare_queryable(key, self._answer) for key in self._said]
+        self._reported = {KEYS.health("front"): health("healthy"), KEYS.extrinsic("front"): extrinsic(BOARD_MOVED)}
+        self._queryables = [session.declare_queryable(key, self._answer) for key in self._reported]
         self._token = session.liveliness().declare_token(KEYS.alive("front"))
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
             key = str(query.key_expr)
-            query.reply(key, self._said[key], encoding=MSGPACK)
+            query.reply(key, self._reported[key], encoding=MSGPACK)
 
     def say(self, key: str, document: bytes) -> None:
         """From now on."""
-        self._said[key] = document
+        self._reported[key] = document
         self._session.put(key, document, encoding=MSGPACK)
 
     def end(self) -> None:
@@ -121,7 +121,7 @@ class Sensors:
             publisher.undeclare()
 
     @property
-    def are_heard(self) -> bool:
+    def are_received(self) -> bool:
         return any(has_subscribers(publisher) for publisher in self._publishers.values())
 
     def _send(self) -> None:

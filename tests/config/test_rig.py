@@ -46,7 +46,7 @@ def names(config: Config) -> list[str]:
     return [pair.name for pair in config.every_pair]
 
 
-def test_eight_cameras_and_three_lidars_are_told_in_sixty_lines(record_property: Any) -> None:
+def test_eight_cameras_and_three_lidars_are_reported_in_sixty_lines(record_property: Any) -> None:
     path = REPOSITORY / "deploy" / "examples" / "rig.yaml"
     lines = path.read_text().splitlines()
     record_property("figure", f"{len(lines)} lines")
@@ -61,7 +61,7 @@ def test_eight_cameras_and_three_lidars_are_told_in_sixty_lines(record_property:
     assert "left-right" in config.left_out, "a strip at the edge of the lens"
 
 
-def test_what_both_sensors_of_a_pair_are_told_comes_to_its_nominal_calibration() -> None:
+def test_what_both_sensors_of_a_pair_are_reported_comes_to_its_nominal_calibration() -> None:
     (front, _) = config_of(rig()).pairs
     assert front.ego is not None
     # 10 m ahead of the vehicle's frame, 1 m to the left, on the ground.
@@ -76,7 +76,7 @@ def test_what_both_sensors_of_a_pair_are_told_comes_to_its_nominal_calibration()
     assert (front.camera.frame_id, front.lidar.frame_id) == ("front", "roof")
 
 
-def test_rows_and_one_line_tell_the_same_pose() -> None:
+def test_rows_and_one_line_give_the_same_pose() -> None:
     rows = [[0.0, 0.0, 1.0, 2.0], [-1.0, 0.0, 0.0, 0.1], [0.0, -1.0, 0.0, 1.5], [0.0, 0.0, 0.0, 1.0]]
     written = rig()
     written["cameras"][0]["T_vehicle_camera"] = rows
@@ -90,7 +90,7 @@ def test_pairs_bear_the_names_of_their_sensors() -> None:
     assert names(config_of(rig(lidars=[ROOF, BUMPER], pairs=listed))) == ["front-bumper", "back"]
 
 
-def test_only_sensors_that_see_something_in_common_are_paired_and_the_others_are_told() -> None:
+def test_only_sensors_that_see_something_in_common_are_paired_and_the_others_are_reported() -> None:
     assert config_of(rig(lidars=[ROOF, BUMPER])).left_out == ("rear-bumper",)
     assert config_of(rig()).left_out == ()
     with pytest.raises(ConfigError, match="no camera sees what a LiDAR sees"):
@@ -125,7 +125,7 @@ def test_what_is_shown_of_a_rig_can_be_read(tmp_path: Any) -> None:
     assert (read.links, read.left_out) == (config.links, config.left_out)
 
 
-def test_topics_of_ros_leave_the_poses_to_be_found() -> None:
+def test_topics_of_ros_leave_the_poses_to_be_discovered() -> None:
     cameras = [{"name": name, "topic": f"/{name}/image_raw/compressed"} for name in ("front", "rear")]
     config = config_of(
         rig(middleware="rmw_zenoh", cameras=cameras, lidars=[{"name": "roof", "topic": "/points"}], ego=None)
@@ -141,7 +141,7 @@ def link(**changes: Any) -> dict[str, Any]:
     return {name: value for name, value in document.items() if value is not None}
 
 
-def test_known_links_stand_beside_the_pairs() -> None:
+def test_known_links_stand_next_to_the_pairs() -> None:
     (known,) = config_of(rig(links=[link()])).links
     assert known.ends == ("front", "rear")
     assert np.array(known.T_a_b) @ [0.0, 0.0, 1.0, 1.0] == pytest.approx([0.0, 0.0, -4.0, 1.0])
@@ -154,7 +154,7 @@ def camera(**changes: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("document", "told"),
+    ("document", "reported"),
     [
         (
             rig(cameras=[camera(intrinsics={**INTRINSICS, "fx": -1})]),
@@ -191,8 +191,8 @@ def camera(**changes: Any) -> dict[str, Any]:
         (rig(cameras=[7]), r"cameras\.0: "),
     ],
 )
-def test_mistakes_are_told_by_their_places(document: dict[str, Any], told: str) -> None:
-    with pytest.raises(ConfigError, match=told):
+def test_mistakes_are_reported_by_their_places(document: dict[str, Any], reported: str) -> None:
+    with pytest.raises(ConfigError, match=reported):
         config_of(document)
 
 

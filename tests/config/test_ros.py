@@ -19,15 +19,15 @@ def document(ros: dict[str, Any], middleware: str = "rmw_zenoh", *names: str) ->
     return {**whole, "pairs": pairs, "middleware": middleware, "ros": ros}
 
 
-def test_ros_is_told_nothing_unless_asked_for() -> None:
+def test_ros_is_reported_nothing_unless_requested() -> None:
     assert RosConfig().publish == ()
     assert not RosConfig().replace_camera_frames
 
 
 @pytest.mark.parametrize("middleware", ["rmw_zenoh", "ros2dds"])
 def test_one_line_makes_a_service_speak_to_ros(middleware: str) -> None:
-    chosen = ["diagnostics", "tf_static", "camera_info", "overlay"]
-    assert Config.model_validate(document({"publish": chosen}, middleware)).ros.publish == tuple(chosen)
+    selected = ["diagnostics", "tf_static", "camera_info", "overlay"]
+    assert Config.model_validate(document({"publish": selected}, middleware)).ros.publish == tuple(selected)
 
 
 @pytest.mark.parametrize(
@@ -41,6 +41,6 @@ def test_one_line_makes_a_service_speak_to_ros(middleware: str) -> None:
         (document({"calibrated_suffix": "/x"}), "calibrated_suffix"),
     ],
 )
-def test_what_cannot_be_told_is_refused_with_a_reason(document: dict[str, Any], complaint: str) -> None:
+def test_what_cannot_be_determined_is_refused_with_a_reason(document: dict[str, Any], complaint: str) -> None:
     with pytest.raises(ValidationError, match=complaint):
         Config.model_validate(document)

@@ -59,15 +59,15 @@ def test_the_effective_configuration_shows_the_long_form(tmp_path: Path) -> None
         ("/front/compressed_not", "sensor_msgs/msg/Image"),
     ],
 )
-def test_the_name_of_a_topic_tells_the_type_of_images(tmp_path: Path, topic: str, type_name: str) -> None:
+def test_the_name_of_a_topic_reports_the_type_of_images(tmp_path: Path, topic: str, type_name: str) -> None:
     (pair,) = read(tmp_path, ROS_VEHICLE.replace("/front/image_raw/compressed", topic)).every_pair
     assert pair.camera.assumed_type == type_name
     assert set(pair.camera.types) == {"sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"}
 
 
 def test_a_type_that_is_set_is_the_only_one_on_a_topic(tmp_path: Path) -> None:
-    chosen = ROS_VEHICLE.replace("compressed,", "compressed, type: sensor_msgs/msg/Image,")
-    (pair,) = read(tmp_path, chosen).every_pair
+    selected = ROS_VEHICLE.replace("compressed,", "compressed, type: sensor_msgs/msg/Image,")
+    (pair,) = read(tmp_path, selected).every_pair
     assert pair.camera.assumed_type == "sensor_msgs/msg/Image"
     assert pair.camera.types == ("sensor_msgs/msg/Image",)
 
@@ -96,7 +96,7 @@ def test_what_cannot_be_a_stream_is_refused_with_what_to_do(
         read(tmp_path, ROS_VEHICLE.replace(before, after))
 
 
-def test_keys_go_beside_topics(tmp_path: Path) -> None:
+def test_keys_go_next_to_topics(tmp_path: Path) -> None:
     config = read(tmp_path, ROS_VEHICLE.replace("ego: /odometry", "ego: {key: odometry}"))
     assert config.every_pair[0].streams["ego"].place == "odometry"
     assert config.every_pair[0].streams["ego"].encoding == "msgpack"
@@ -140,7 +140,7 @@ WHOLE = {
     "left_out",
     ["T_camera_lidar", "camera.frame_id", "camera.intrinsics", "lidar.frame_id", "ego.T_lidar_ego"],
 )
-def test_a_pair_is_awaited_where_something_is_left_out(left_out: str) -> None:
+def test_a_pair_is_pending_where_something_is_left_out(left_out: str) -> None:
     whole = Config.model_validate({"middleware": "ros2dds", "pairs": [WHOLE]})
     assert (len(whole.pairs), len(whole.awaited)) == (1, 0)
     place, _, name = left_out.rpartition(".")
@@ -160,6 +160,6 @@ def test_a_pair_is_awaited_where_something_is_left_out(left_out: str) -> None:
         (EIGHT_LINES[: EIGHT_LINES.index("pairs")] + "pairs: []\n", "give 1 to 32"),
     ],
 )
-def test_an_awaited_pair_is_checked_as_any_other(tmp_path: Path, text: str, complaint: str) -> None:
+def test_an_pending_pair_is_checked_as_any_other(tmp_path: Path, text: str, complaint: str) -> None:
     with pytest.raises(ConfigError, match=complaint):
         read(tmp_path, text)

@@ -82,12 +82,12 @@ def take_steps(stage: Stage, built: bool) -> None:
                 folder = Path(step.text)
                 folder.mkdir(parents=True, exist_ok=True)
             case "COPY" if step.text.startswith("--from="):
-                *_, source, target = step.words()
+                *_, source, target = step.labels()
                 if source != target and Path(source).exists():
                     shutil.copytree(source, target, symlinks=True, dirs_exist_ok=True)
                 assert built or not Path(target).exists()
             case "COPY":
-                *sources, target = step.words()
+                *sources, target = step.labels()
                 _copy(sources, folder / target)
             case "RUN" if step.text == "coec warmup":
                 pass  # takes minutes for all lenses; a service compiles those that it needs
@@ -131,7 +131,7 @@ class Container:
         if not self.service.get("read_only"):
             return limited
         # What is mounted by itself stays as it is when the root is made read-only, for this program alone.
-        volumes = self.image.last("VOLUME").words()
+        volumes = self.image.last("VOLUME").labels()
         steps = [f"mount --bind {folder} {folder}" for folder in volumes]
         steps.append("mount -o remount,bind,ro /")
         steps += [f"mount -t tmpfs tmpfs {folder}" for folder in _strings(self.service.get("tmpfs"))]

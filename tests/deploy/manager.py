@@ -12,23 +12,23 @@ from pathlib import Path
 @contextmanager
 def listening(path: Path) -> Iterator[list[str]]:
     """The messages that come to a NOTIFY_SOCKET, in order; any user may write to it."""
-    told: list[str] = []
-    ended = threading.Event()
+    reported: list[str] = []
+    finished = threading.Event()
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
         sock.bind(str(path))
         path.chmod(0o666)
         sock.settimeout(0.2)
 
         def read() -> None:
-            while not ended.is_set():
+            while not finished.is_set():
                 with suppress(TimeoutError):
-                    told.append(sock.recv(4096).decode())
+                    reported.append(sock.recv(4096).decode())
 
         thread = threading.Thread(target=read)
         thread.start()
         try:
-            yield told
+            yield reported
         finally:
-            ended.set()
+            finished.set()
             thread.join()
             path.unlink()

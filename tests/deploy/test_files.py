@@ -35,41 +35,41 @@ def test_every_image_is_pinned_by_its_digest() -> None:
     assert {service.get("image") for service in compose().values()} == {"coec"}, "an image of another origin"
 
 
-def test_what_the_image_is_built_from_is_not_kept_from_it() -> None:
+def test_what_the_image_is_built_from_is_not_retained_from_it() -> None:
     let_in = (REPOSITORY / ".dockerignore").read_text().splitlines()
-    copied = [step.words()[:-1] for step in stages()[0].steps if step.instruction == "COPY"]
+    copied = [step.labels()[:-1] for step in stages()[0].steps if step.instruction == "COPY"]
     assert copied
     assert [source for sources in copied for source in sources if f"!{source}" not in let_in] == []
 
 
-def pin_images(folder: Path, told: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+def pin_images(folder: Path, reported: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     """`deploy/pin-images` in a copy of the checkout, where the registry tells something."""
     (folder / "deploy").mkdir()
     shutil.copy(DEPLOY / "pin-images", folder / "deploy")
     shutil.copy(REPOSITORY / "Dockerfile", folder)
     docker = folder / "bin" / "docker"
     docker.parent.mkdir()
-    docker.write_text(f'#!/bin/sh\necho "$@" >> {folder}/asked\n{told}\n')
+    docker.write_text(f'#!/bin/sh\necho "$@" >> {folder}/asked\n{reported}\n')
     docker.chmod(0o755)
     environment = {"PATH": f"{docker.parent}:/usr/bin:/bin"}
     command = [str(folder / "deploy" / "pin-images"), *arguments]
     return subprocess.run(command, env=environment, capture_output=True, text=True)
 
 
-def test_pin_images_writes_the_digest_that_the_registry_tells(tmp_path: Path) -> None:
-    ended = pin_images(tmp_path, f"echo {OTHER}", "3.11.99-slim-bookworm")
-    assert ended.returncode == 0, ended.stderr
+def test_pin_images_writes_the_digest_that_the_registry_reports(tmp_path: Path) -> None:
+    finished = pin_images(tmp_path, f"echo {OTHER}", "3.11.99-slim-bookworm")
+    assert finished.returncode == 0, finished.stderr
     before, after = ((folder / "Dockerfile").read_text() for folder in (REPOSITORY, tmp_path))
     assert after == re.sub(rf"python:\S+@{DIGEST}", f"python:3.11.99-slim-bookworm@{OTHER}", before)
-    (asked,) = (tmp_path / "asked").read_text().splitlines()
-    assert asked == "buildx imagetools inspect python:3.11.99-slim-bookworm --format {{.Manifest.Digest}}"
+    (requested,) = (tmp_path / "asked").read_text().splitlines()
+    assert requested == "buildx imagetools inspect python:3.11.99-slim-bookworm --format {{.Manifest.Digest}}"
 
 
-@pytest.mark.parametrize("told", ["exit 1", "echo not found"], ids=["no registry", "no digest"])
-def test_pin_images_changes_nothing_without_a_digest(tmp_path: Path, told: str) -> None:
-    ended = pin_images(tmp_path, told)
-    assert ended.returncode == 1
-    assert "nothing was changed" in ended.stderr
+@pytest.mark.parametrize("reported", ["exit 1", "echo not found"], ids=["no registry", "no digest"])
+def test_pin_images_changes_nothing_without_a_digest(tmp_path: Path, reported: str) -> None:
+    finished = pin_images(tmp_path, reported)
+    assert finished.returncode == 1
+    assert "nothing was changed" in finished.stderr
     assert (tmp_path / "Dockerfile").read_text() == (REPOSITORY / "Dockerfile").read_text()
 
 
@@ -80,7 +80,7 @@ def test_kernels_are_compiled_into_the_volume_of_the_cache_by_the_user_who_runs_
 
 
 # -------------------------------------------------------------------------------------------------------- compose
-def test_every_service_is_bounded_confined_and_asked_whether_it_is_well() -> None:
+def test_every_service_is_bounded_confined_and_requested_whether_it_is_well() -> None:
     image = stages()[-1]
     for name, service in compose().items():
         assert re.fullmatch(r"\d+[gm]", service["mem_limit"]), name
@@ -112,7 +112,7 @@ def test_the_unit_starts_what_the_image_starts() -> None:
     image = stages()[-1]
     program, *arguments = exec_start()
     assert program == "/opt/coec/bin/coec"
-    assert [Path(program).name, *arguments] == [*image.last("ENTRYPOINT").words(), *image.last("CMD").words()]
+    assert [Path(program).name, *arguments] == [*image.last("ENTRYPOINT").labels(), *image.last("CMD").labels()]
 
 
 def test_the_unit_lets_packets_to_the_router_of_this_computer_through_and_no_others() -> None:
@@ -152,10 +152,10 @@ def test_systemd_takes_the_unit_and_finds_it_confined(
         capture_output=True,
         text=True,
     )
-    found = re.search(r"Overall exposure level for coec.service: (\d+\.\d)", rated.stdout)
-    assert found is not None, rated.stderr
-    record_property("figure", f"exposure {found[1]}")
-    assert float(found[1]) < 2.0
+    result = re.search(r"Overall exposure level for coec.service: (\d+\.\d)", rated.stdout)
+    assert result is not None, rated.stderr
+    record_property("figure", f"exposure {result[1]}")
+    assert float(result[1]) < 2.0
 
 
 # -------------------------------------------------------------------------------------------------- configurations
@@ -209,7 +209,7 @@ def test_nothing_stands_in_an_example_that_need_not(path: Path) -> None:
 
 
 # ------------------------------------------------------------------------------------------------------ the wheel
-def test_the_wheel_of_the_dockerfile_runs_beside_the_packages_of_this_environment(tmp_path: Path) -> None:
+def test_the_wheel_of_the_dockerfile_runs_next_to_the_packages_of_this_environment(tmp_path: Path) -> None:
     """The short form of what `test_vehicle` builds from nothing: the wheel by its own command, then what the image
     starts, of a configuration that is not there."""
     (build,) = [step.text for step in stages()[0].steps if "hatchling build" in step.text]
@@ -226,6 +226,8 @@ def test_the_wheel_of_the_dockerfile_runs_beside_the_packages_of_this_environmen
     assert (target / "coec" / "io" / "depth" / "cards" / "street.onnx").is_file()
     program = f"import sys; sys.path.insert(0, {str(target)!r}); from coec.cli.main import main; sys.exit(main())"
     checked = [sys.executable, "-I", "-c", program]
-    ended = subprocess.run([*checked, *stages()[-1].last("CMD").words()], capture_output=True, text=True, cwd=tmp_path)
-    assert ended.returncode == ConfigError.exit_code
-    assert "cannot read /etc/coec/coec.yaml" in ended.stderr
+    finished = subprocess.run(
+        [*checked, *stages()[-1].last("CMD").labels()], capture_output=True, text=True, cwd=tmp_path
+    )
+    assert finished.returncode == ConfigError.exit_code
+    assert "cannot read /etc/coec/coec.yaml" in finished.stderr

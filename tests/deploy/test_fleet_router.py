@@ -76,17 +76,17 @@ def fleet(authority: TestAuthority, tmp_path_factory: pytest.TempPathFactory) ->
     endpoint, loopback = f"tls/localhost:{ports[0]}", f"tcp/127.0.0.1:{ports[2]}"
     with ExitStack() as stack:
         router = stack.enter_context(zenoh.open(zenoh.Config.from_file(central)))
-        told = STORAGES["storages"]["last_words"]
-        storage = stack.enter_context(MemoryStorage(router, told["key_expr"], complete=told["complete"]))
+        reported = STORAGES["storages"]["last_words"]
+        storage = stack.enter_context(MemoryStorage(router, reported["key_expr"], complete=reported["complete"]))
         stack.enter_context(zenoh.open(zenoh.Config.from_file(of_vehicle)))
         yield Fleet(authority, router, endpoint, loopback, storage)
 
 
-def test_the_storage_keeps_what_is_said_last_and_nothing_else() -> None:
+def test_the_storage_keeps_what_is_reported_last_and_nothing_else() -> None:
     (storage,) = STORAGES["storages"].values()
     assert storage["volume"]["id"] in STORAGES["volumes"]
-    kept = zenoh.KeyExpr(storage["key_expr"])
-    assert kept == zenoh.KeyExpr(ALL.last("*"))
+    retained = zenoh.KeyExpr(storage["key_expr"])
+    assert retained == zenoh.KeyExpr(ALL.last("*"))
     others = (
         KEYS.health(PAIR),
         KEYS.status,
@@ -94,7 +94,7 @@ def test_the_storage_keeps_what_is_said_last_and_nothing_else() -> None:
         KEYS.window(PAIR, "front-1"),
         KEYS.alive(PAIR),
     )
-    assert not [key for key in others if kept.intersects(zenoh.KeyExpr(key))]
+    assert not [key for key in others if retained.intersects(zenoh.KeyExpr(key))]
 
 
 def test_no_door_of_the_fleet_is_open_to_everybody() -> None:
@@ -102,7 +102,7 @@ def test_no_door_of_the_fleet_is_open_to_everybody() -> None:
 
 
 @pytest.mark.fault("the vehicle is switched off", "its last word is still available, marked as such")
-def test_a_vehicle_that_was_heard_once_can_be_asked_about_when_it_has_gone(fleet: Fleet, tmp_path: Path) -> None:
+def test_a_vehicle_that_was_received_once_can_be_requested_about_when_it_has_gone(fleet: Fleet, tmp_path: Path) -> None:
     with connected_by(fleet.way("viewer"), PATIENCE_S) as viewer:
         config = ZenohConfig(connect=(fleet.of_vehicle,))
         with serving(tmp_path, config) as vehicle:

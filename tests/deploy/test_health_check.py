@@ -29,9 +29,9 @@ def checked(heartbeat: Path) -> tuple[int, str]:
     """Exit status and words of the health check, which finds its program where the image has it: in the PATH."""
     command = stages()[-1].health_check
     environment = {"PATH": f"{DEPLOY}:{os.defpath}", "COEC_HEARTBEAT_FILE": str(heartbeat)}
-    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE_S)
-    assert ended.stderr == ""
-    return ended.returncode, ended.stdout
+    finished = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE_S)
+    assert finished.stderr == ""
+    return finished.returncode, finished.stdout
 
 
 @pytest.fixture
@@ -53,13 +53,13 @@ def serving(host: str, *, alive: bool = True) -> Iterator[tuple[str, int]]:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0", "localhost", "::1", "::"])
-def test_a_service_that_serves_pages_is_asked_for_one(heartbeat: Path, host: str) -> None:
+def test_a_service_that_serves_pages_is_requested_one(heartbeat: Path, host: str) -> None:
     if ":" in host and not socket.has_ipv6:
         pytest.skip("needs IPv6")
     with serving(host) as address:
         ServiceManagerNotifier(None, heartbeat).watchdog(address)
-        status, words = checked(heartbeat)
-    assert (status, "answers" in words) == (0, True), words
+        status, text = checked(heartbeat)
+    assert (status, "answers" in text) == (0, True), text
 
 
 @pytest.mark.fault(
@@ -88,14 +88,14 @@ def test_a_service_that_is_stuck_is_not_alive(heartbeat: Path) -> None:
     assert checked(heartbeat) == (1, f"nothing listens on 127.0.0.1:{address[1]}\n")
     notifier.watchdog(None)
     os.utime(heartbeat, (0, 0))
-    status, words = checked(heartbeat)
-    assert (status, words.startswith("stuck: the last heartbeat is ")) == (1, True)
+    status, text = checked(heartbeat)
+    assert (status, text.startswith("stuck: the last heartbeat is ")) == (1, True)
 
 
-def test_without_http_the_heartbeat_is_looked_at(heartbeat: Path) -> None:
+def test_without_http_the_heartbeat_is_checked(heartbeat: Path) -> None:
     ServiceManagerNotifier(None, heartbeat).watchdog(None)
-    status, words = checked(heartbeat)
-    assert (status, words.startswith("alive: the last heartbeat is ")) == (0, True)
+    status, text = checked(heartbeat)
+    assert (status, text.startswith("alive: the last heartbeat is ")) == (0, True)
 
 
 @pytest.mark.parametrize("content", [None, "", "no address\n", "127.0.0.1\n", "$(touch /tmp/x) 1\n", "a b c\n"])
@@ -109,8 +109,8 @@ def test_a_service_that_ends_takes_its_heartbeat_along(heartbeat: Path) -> None:
     notifier = ServiceManagerNotifier(None, heartbeat)
     notifier.watchdog(None)
     notifier.stopping()
-    status, words = checked(heartbeat)
-    assert (status, words.startswith("no heartbeat")) == (1, True)
+    status, text = checked(heartbeat)
+    assert (status, text.startswith("no heartbeat")) == (1, True)
 
 
 def test_no_health_check_that_runs_often_starts_an_interpreter() -> None:

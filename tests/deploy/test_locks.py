@@ -77,7 +77,7 @@ def test_what_a_command_of_the_pages_needs_is_pinned(project: Any, extra: str) -
     assert missing(project["project"]["optional-dependencies"][extra], LOCK) == []
 
 
-def test_what_the_site_and_the_checks_need_is_pinned_beside_it_and_nothing_twice(project: Any) -> None:
+def test_what_the_site_and_the_checks_need_is_pinned_next_to_it_and_nothing_twice(project: Any) -> None:
     assert missing(project["dependency-groups"]["docs"], LOCK, DOCS) == []
     assert missing(project["dependency-groups"]["checks"], *LOCKS) == []
     assert all(twice(*(lock.read_text() for lock in two)) == set() for two in combinations(LOCKS, 2))
@@ -93,19 +93,19 @@ def test_what_lists_the_packages_of_an_image_is_pinned(project: Any) -> None:
 def needed(requirements: Iterable[str], extras: Sequence[str] = ("",)) -> dict[NormalizedName, Distribution]:
     """The installed distributions that these requirements come to on this machine, by name. `extras` are those of the
     package that states them."""
-    found: dict[NormalizedName, Distribution] = {}
+    result: dict[NormalizedName, Distribution] = {}
     waiting = [(Requirement(line), tuple(extras)) for line in requirements]
     visited = set[tuple[NormalizedName, tuple[str, ...]]]()
     while waiting:
         requirement, stated_by = waiting.pop()
         if requirement.marker is not None and not any(requirement.marker.evaluate({"extra": e}) for e in stated_by):
             continue
-        name, asked = canonicalize_name(requirement.name), ("", *sorted(requirement.extras))
-        if (name, asked) not in visited:
-            visited.add((name, asked))
-            found[name] = distribution(name)
-            waiting += [(Requirement(line), asked) for line in found[name].requires or ()]
-    return found
+        name, requested = canonicalize_name(requirement.name), ("", *sorted(requirement.extras))
+        if (name, requested) not in visited:
+            visited.add((name, requested))
+            result[name] = distribution(name)
+            waiting += [(Requirement(line), requested) for line in result[name].requires or ()]
+    return result
 
 
 def test_the_table_of_licences_is_that_of_the_lock_file(project: Any) -> None:

@@ -24,7 +24,7 @@ OF_SCRAPE = frozenset({"vehicle", "job", "instance"})
 FUNCTIONS = frozenset(
     {"abs", "histogram_quantile", "increase", "label_replace", "label_values", "rate", "sum", "max", "min"}
 )
-WORDS = frozenset({"and", "or", "by", "on", "unless", "without", "le"})
+TEXT = frozenset({"and", "or", "by", "on", "unless", "without", "le"})
 DURATION = re.compile(r"\d+(ms|[smhdwy])")
 TOKEN = re.compile(
     r"""\s+|(?P<text>"(?:[^"\\]|\\.)*")|(?P<variable>\$\w+)|(?P<duration>\d+(?:ms|[smhdwy])\b)|(?P<number>\d+(?:\.\d+)?)"""
@@ -47,24 +47,24 @@ METRICS = {
 
 
 def tokens(expression: str) -> list[tuple[str, str]]:
-    found, at = [], 0
+    result, at = [], 0
     while at < len(expression):
         match = TOKEN.match(expression, at)
         assert match is not None, f"not PromQL at {expression[at : at + 20]!r}"
         if match.lastgroup is not None:
-            found.append((match.lastgroup, match[0]))
+            result.append((match.lastgroup, match[0]))
         at = match.end()
-    return found
+    return result
 
 
 def check(expression: str) -> set[str]:
     """The metrics in an expression, each with its labels, of which there are all; brackets are paired."""
-    found, words = set(), tokens(expression)
+    result, wording = set(), tokens(expression)
     depth = []
     pairs = {")": "(", "}": "{", "]": "["}
     metric: Metric | None = None
-    for index, (kind, text) in enumerate(words):
-        after = words[index + 1][1] if index + 1 < len(words) else ""
+    for index, (kind, text) in enumerate(wording):
+        after = wording[index + 1][1] if index + 1 < len(wording) else ""
         if text in pairs.values() and kind == "operator":
             depth.append(text)
         elif text in pairs and kind == "operator":
@@ -74,28 +74,28 @@ def check(expression: str) -> set[str]:
             assert metric is not None, f"{text} belongs to nothing in {expression}"
             assert text in metric.labels, f"{text} is no label there: {expression}"
             if text == "coec_health":
-                asked = json.loads(words[index + 2][1]).split("|")
-                assert set(asked) <= set(get_args(HealthState)), expression
+                requested = json.loads(wording[index + 2][1]).split("|")
+                assert set(requested) <= set(get_args(HealthState)), expression
         elif kind == "name" and after in ("(", "by"):
             assert text in FUNCTIONS | {"by", "and", "or"}, f"{text} is no function of PromQL: {expression}"
-        elif kind == "name" and text not in WORDS and not _is_grouping(words, index):
+        elif kind == "name" and text not in TEXT and not _is_grouping(wording, index):
             metric = METRICS.get(text)
             assert metric is not None, f"{text} is no metric of the service: {expression}"
-            found.add(text)
-        elif kind == "name" and _is_grouping(words, index):
+            result.add(text)
+        elif kind == "name" and _is_grouping(wording, index):
             assert any(text in one.labels for one in METRICS.values()), f"{text} is no label: {expression}"
     assert not depth, expression
-    return found
+    return result
 
 
-def _is_grouping(words: list[tuple[str, str]], index: int) -> bool:
+def _is_grouping(wording: list[tuple[str, str]], index: int) -> bool:
     """Whether a name stands in the brackets behind `by`, or as the name behind a metric in `label_values`."""
     opened = 0
     for back in range(index - 1, -1, -1):
-        opened += {")": 1, "(": -1}.get(words[back][1], 0)
+        opened += {")": 1, "(": -1}.get(wording[back][1], 0)
         if opened < 0:
-            before = words[back - 1][1] if back else ""
-            return before == "by" or (before == "label_values" and words[index - 1][1] == ",")
+            before = wording[back - 1][1] if back else ""
+            return before == "by" or (before == "label_values" and wording[index - 1][1] == ",")
     return False
 
 
@@ -119,9 +119,9 @@ def expressions_of_dashboard() -> Iterator[tuple[str, str]]:
         yield annotation["name"], annotation["expr"]
 
 
-def test_every_expression_of_the_dashboard_asks_for_what_there_is() -> None:
-    asked = {name for _, expression in expressions_of_dashboard() for name in check(expression)}
-    assert {"coec_health", "coec_drift", "coec_losses_total", "coec_query_seconds_bucket"} <= asked
+def test_every_expression_of_the_dashboard_requests_what_there_is() -> None:
+    requested = {name for _, expression in expressions_of_dashboard() for name in check(expression)}
+    assert {"coec_health", "coec_drift", "coec_losses_total", "coec_query_seconds_bucket"} <= requested
 
 
 def test_every_legend_names_labels_that_the_answer_has() -> None:
@@ -147,7 +147,7 @@ def test_panels_do_not_lie_on_each_other_and_choose_their_source() -> None:
     assert all(panel["datasource"]["uid"] == "${datasource}" for panel in panels)
 
 
-def test_every_alert_asks_for_what_there_is_and_says_what_to_do() -> None:
+def test_every_alert_requests_what_there_is_and_reports_what_to_do() -> None:
     names = [alert["alert"] for alert in alerts()]
     assert len(set(names)) == len(names) >= 10
     for alert in alerts():
@@ -156,8 +156,8 @@ def test_every_alert_asks_for_what_there_is_and_says_what_to_do() -> None:
         assert alert["labels"]["severity"] in ("page", "ticket")
         assert DURATION.fullmatch(alert.get("for", "1s"))
         known = frozenset.union(*(METRICS[name].labels for name in metrics)) | {"place"}
-        told = " ".join(alert["annotations"].values())
-        assert set(re.findall(r"\$labels\.(\w+)", told)) <= known, alert["alert"]
+        reported = " ".join(alert["annotations"].values())
+        assert set(re.findall(r"\$labels\.(\w+)", reported)) <= known, alert["alert"]
         assert set(alert["annotations"]) == {"summary", "description"}
 
 

@@ -71,13 +71,13 @@ def test_the_page_names_topics_and_types_as_they_are_published() -> None:
         "camera_info": (keys.camera_info_topic("PAIR"), messages.CAMERA_INFO),
         "overlay": (keys.overlay_topic("PAIR"), messages.COMPRESSED_IMAGE),
     }
-    told = {row[0].strip("`"): (row[1].strip("`"), row[2].strip("`")) for row in rows("Published topics")}
-    assert {name: (topic.replace("<pair>", "PAIR"), kind) for name, (topic, kind) in told.items()} == published
+    reported = {row[0].strip("`"): (row[1].strip("`"), row[2].strip("`")) for row in rows("Published topics")}
+    assert {name: (topic.replace("<pair>", "PAIR"), kind) for name, (topic, kind) in reported.items()} == published
 
 
 def test_the_page_says_the_level_of_every_state() -> None:
-    told = {row[0]: set(re.findall(r"`(\w+)`", row[1])) for row in rows("/diagnostics")}
-    assert told == {
+    reported = {row[0]: set(re.findall(r"`(\w+)`", row[1])) for row in rows("/diagnostics")}
+    assert reported == {
         level.name: {state for state, number in ROS_LEVELS.items() if number == level} for level in DiagnosticLevel
     }
 

@@ -64,8 +64,10 @@ def refusal() -> str | None:
         "mount -t tmpfs tmpfs /srv && mkdir /srv/changed /srv/work /srv/root && mount -t overlay overlay "
         "-o lowerdir=/,upperdir=/srv/changed,workdir=/srv/work /srv/root && ip link set lo up && which openssl setpriv"
     )
-    ended = subprocess.run([*UNSHARE, "--net", "sh", "-c", tried], capture_output=True, text=True)
-    return None if ended.returncode == 0 else f"this machine lets nobody make namespaces or overlays: {ended.stderr}"
+    finished = subprocess.run([*UNSHARE, "--net", "sh", "-c", tried], capture_output=True, text=True)
+    return (
+        None if finished.returncode == 0 else f"this machine lets nobody make namespaces or overlays: {finished.stderr}"
+    )
 
 
 def lived(**story: object) -> Mapping[str, Any]:
@@ -77,11 +79,11 @@ def lived(**story: object) -> Mapping[str, Any]:
     path = os.pathsep.join(str(REPOSITORY / folder) for folder in ("service", "tests"))
     command = [*UNSHARE, sys.executable, "-m", "deploy.vehicle", json.dumps(story)]
     # For a group of its own there is nobody to be left behind: the namespace of processes ends with its first.
-    ended = subprocess.run(
+    finished = subprocess.run(
         command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, timeout=PATIENCE_S
     )
-    assert ended.returncode == 0, ended.stderr[-20_000:]
-    report: Mapping[str, Any] = json.loads(ended.stdout.splitlines()[-1])
+    assert finished.returncode == 0, finished.stderr[-20_000:]
+    report: Mapping[str, Any] = json.loads(finished.stdout.splitlines()[-1])
     return report
 
 
@@ -96,10 +98,10 @@ def silent(report: Mapping[str, Any]) -> str:
     assert report["strangers"] == {}
     assert report["names asked"] == []
     assert report["unseen"] == 0
-    seen, names, told = report["control"]
+    seen, names, reported = report["control"]
     assert seen > 0, "the world does not see packets"
     assert names, "the world does not hear who asks for a name"
-    assert told > 0, "the world does not answer"
+    assert reported > 0, "the world does not answer"
     return f"{sum(report['strangers'].values())} of {report['packets']} packets in {report['lived_s']:.0f} s"
 
 
@@ -128,7 +130,7 @@ def test_listening_sockets_are_those_documented(short: Mapping[str, Any], record
     record_property("figure", ", ".join(f"{program} {len(sockets)}" for program, sockets in seen.items()))
 
 
-def test_health_checks_tell_well_from_unwell(short: Mapping[str, Any]) -> None:
+def test_health_checks_report_well_from_unwell(short: Mapping[str, Any]) -> None:
     assert short["coec: unwell before it runs"] == 1
     assert [short[f"{name}: health"] for name in compose()] == [0, 0, 0]
 
@@ -137,15 +139,15 @@ def test_health_checks_tell_well_from_unwell(short: Mapping[str, Any]) -> None:
     "a command with the certificate of the observer",
     "the router hands it to nobody, while the observer's questions are answered",
 )
-def test_the_observer_may_ask_and_not_command(short: Mapping[str, Any]) -> None:
+def test_the_observer_may_query_and_not_command(short: Mapping[str, Any]) -> None:
     assert short["viewer"] == {"health": "answered", "command": "nothing"}
 
 
-def test_the_manager_is_told_of_the_start_of_progress_and_of_the_end(short: Mapping[str, Any]) -> None:
-    told = short["manager: told"]
+def test_the_manager_is_reported_of_the_start_of_progress_and_of_the_end(short: Mapping[str, Any]) -> None:
+    reported = short["manager: told"]
     # That the start takes longer is said where it does: not where the kernels are there.
-    assert set(told) - {"EXTEND_TIMEOUT_USEC=20000000"} == {"READY=1", "WATCHDOG=1", "STOPPING=1"}
-    assert told[-1] == "STOPPING=1"
+    assert set(reported) - {"EXTEND_TIMEOUT_USEC=20000000"} == {"READY=1", "WATCHDOG=1", "STOPPING=1"}
+    assert reported[-1] == "STOPPING=1"
     assert unit()["Type"] == ["notify"]
 
 
@@ -166,11 +168,11 @@ def test_memory_is_well_within_its_limits(short: Mapping[str, Any]) -> None:
 
 
 def test_the_observer_hears_of_health_and_of_the_end(short: Mapping[str, Any]) -> None:
-    heard = short["observer: heard"]
-    assert heard["alive"][0] == "True"
-    assert heard["alive"][-1] == "False"
-    assert "unknown" in heard["health"]
-    assert heard["extrinsic"]
+    received = short["observer: heard"]
+    assert received["alive"][0] == "True"
+    assert received["alive"][-1] == "False"
+    assert "unknown" in received["health"]
+    assert received["extrinsic"]
 
 
 @pytest.fixture(scope="module")
@@ -192,11 +194,11 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Any]:
 
 def networks() -> list[str]:
     """All that this machine has: that of the package, the maps that come with frames, and those of the samples."""
-    found = ["street", "stereo"]
+    result = ["street", "stereo"]
     data = os.environ.get("COEC_SAMPLE_DATA")
     if data:
-        found += [f"{data}/depth/{card.file}" for card in list_models() if card.file and card.sha256]
-    return [name for name in found if not name.startswith("/") or Path(name).is_file()]
+        result += [f"{data}/depth/{card.file}" for card in list_models() if card.file and card.sha256]
+    return [name for name in result if not name.startswith("/") or Path(name).is_file()]
 
 
 @pytest.mark.slow

@@ -75,8 +75,8 @@ class Environment:
 
     def run(self, *arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
         """The interpreter with these arguments, to its end."""
-        words = [str(self.python), *map(str, arguments)]
-        return subprocess.run(words, capture_output=True, text=True, cwd=cwd, env=self.variables(cwd))
+        text = [str(self.python), *map(str, arguments)]
+        return subprocess.run(text, capture_output=True, text=True, cwd=cwd, env=self.variables(cwd))
 
     def coec(self, *arguments: object, cwd: Path) -> str:
         """Standard output of `coec ARGS`, which succeeds."""
@@ -104,7 +104,7 @@ def vehicle(wheel: Path, tmp_path: Path) -> Environment:
     return environment
 
 
-def test_every_module_of_the_wheel_imports_beside_what_it_declares_alone(vehicle: Environment, tmp_path: Path) -> None:
+def test_every_module_of_the_wheel_imports_next_to_what_it_declares_alone(vehicle: Environment, tmp_path: Path) -> None:
     done = vehicle.run("-c", IMPORT_ALL, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     file, errors = json.loads(done.stdout)
@@ -123,10 +123,10 @@ def test_the_wheel_alone_serves_calibrates_replays_and_evaluates_many(
     recorded_windows(windows)
     window = windows / "one" / "one-1.mcap"
     out = tmp_path / "out"
-    drawn = {"result.json", "report.html", "overlay_before.png", "overlay_after.png", "close_ups.png"}
+    rendered = {"result.json", "report.html", "overlay_before.png", "overlay_after.png", "close_ups.png"}
     calibrated = json.loads(vehicle.coec("calibrate", window, "--output", out, "--json", cwd=tmp_path))
     assert calibrated["verdict"]["decision"] == "accepted"
-    assert drawn <= {path.name for path in out.iterdir()}
+    assert rendered <= {path.name for path in out.iterdir()}
     assert "identical" in vehicle.coec("replay", window, cwd=tmp_path)
 
     configuration = write_configuration(tmp_path / "service", rendered_source(SMALL), router.endpoint)

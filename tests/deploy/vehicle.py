@@ -48,7 +48,7 @@ CONFIGURATION = Path("/etc/coec/coec.yaml")
 NOTIFY_SOCKET = Path("/run/notify")
 """The manager's: nobody reads it but where that is looked at."""
 
-ASK_AGAIN = ("busy", "not_drawn")
+QUERY_AGAIN = ("busy", "not_drawn")
 """Refusals that say so: the worker is at work."""
 
 
@@ -62,7 +62,7 @@ class Vehicle:
     """
 
     real: bool
-    said: dict[str, Any] = field(default_factory=dict)
+    reported: dict[str, Any] = field(default_factory=dict)
 
     def container(self, name: str) -> Container:
         """Of a service in the compose file."""
@@ -75,8 +75,8 @@ class Vehicle:
     def command(self, name: str) -> list[str]:
         """Entry point and arguments of a service, as they are written."""
         image = stages()[-1]
-        arguments = compose()[name].get("command") or image.last("CMD").words()
-        return [*image.last("ENTRYPOINT").words(), *arguments]
+        arguments = compose()[name].get("command") or image.last("CMD").labels()
+        return [*image.last("ENTRYPOINT").labels(), *arguments]
 
     def check(self, name: str) -> list[str]:
         """The health check of a service: its own, or that of the image."""
@@ -114,7 +114,7 @@ class Vehicle:
         """As the engine does: its signal, and so much time as the compose file gives."""
         grace_s = float(compose()[name]["stop_grace_period"].removesuffix("s"))
         process.send_signal(signal.SIGTERM)
-        self.said[f"{name}: exit"] = process.wait(grace_s)
+        self.reported[f"{name}: exit"] = process.wait(grace_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +147,7 @@ def main(story: Story) -> None:
     if story.build:
         for stage in stages():
             take_steps(stage, built=stage is not stages()[0])
-        vehicle.said["installed"] = sorted(path.name for path in Path("/opt/coec/sbom").iterdir())
+        vehicle.reported["installed"] = sorted(path.name for path in Path("/opt/coec/sbom").iterdir())
     else:
         stand_in()
         take_steps(stages()[-1], built=True)
@@ -156,31 +156,35 @@ def main(story: Story) -> None:
     with watched() as world:
         live(vehicle, story)
         if story.build:
-            vehicle.said["unit: exit without a configuration"] = started_without_configuration(vehicle)
-        vehicle.said["commands"] = [ended(["coec", *words]) for words in story.commands]
-        vehicle.said["strangers"] = world.strangers(ROUTER)
-        vehicle.said["packets"] = sum(world.packets.values())
-        vehicle.said["names asked"] = list(world.names_asked)
+            vehicle.reported["unit: exit without a configuration"] = started_without_configuration(vehicle)
+        vehicle.reported["commands"] = [finished(["coec", *text]) for text in story.commands]
+        vehicle.reported["strangers"] = world.strangers(ROUTER)
+        vehicle.reported["packets"] = sum(world.packets.values())
+        vehicle.reported["names asked"] = list(world.names_requested)
         before = sum(world.strangers(ROUTER).values())
         subprocess.run([sys.executable, "-c", story.chatter], check=True)
         wait_until(
             # The socket that sees packets is read by another thread than the listener's.
-            lambda: bool(world.told and world.names_asked) and sum(world.strangers(ROUTER).values()) > before,
+            lambda: bool(world.reported and world.names_requested) and sum(world.strangers(ROUTER).values()) > before,
             "what the control said, at the listener and among the packets",
             PATIENCE_S,
         )
-        vehicle.said["control"] = [sum(world.strangers(ROUTER).values()) - before, world.names_asked, len(world.told)]
-    vehicle.said["unseen"] = world.unseen
-    print(json.dumps(vehicle.said))
+        vehicle.reported["control"] = [
+            sum(world.strangers(ROUTER).values()) - before,
+            world.names_requested,
+            len(world.reported),
+        ]
+    vehicle.reported["unseen"] = world.unseen
+    print(json.dumps(vehicle.reported))
 
 
 def stand_in() -> None:
     """/opt/coec, as far as commands are concerned: this checkout's, with its interpreter and its packages."""
     folder = Path("/opt/coec/bin")
     folder.mkdir(parents=True)
-    for name, words in (("coec", "-m coec"), ("python", "")):
+    for name, text in (("coec", "-m coec"), ("python", "")):
         script = folder / name
-        script.write_text(f'#!/bin/sh\nPYTHONPATH={REPOSITORY / "service"} exec {sys.executable} {words} "$@"\n')
+        script.write_text(f'#!/bin/sh\nPYTHONPATH={REPOSITORY / "service"} exec {sys.executable} {text} "$@"\n')
         script.chmod(0o755)
 
 
@@ -217,46 +221,46 @@ def owner_of_image() -> tuple[int, int]:
 
 def live(vehicle: Vehicle, story: Story) -> None:
     """The router, the service as it is shipped, then with a drive, and the observer; each asked whether it is well."""
-    said = vehicle.said
+    reported = vehicle.reported
     for configuration in story.configurations:
         note_sockets(vehicle, configuration, "--embedded-router")
     with vehicle.running("router") as router:
         wait_until(lambda: lives(router) and bool(sockets_of(router)), "the router", PATIENCE_S)
-        said["router: health"] = vehicle.health("router")
-        said["router: sockets"] = sockets_of(router)
-        said["coec: unwell before it runs"] = vehicle.health("coec")
+        reported["router: health"] = vehicle.health("router")
+        reported["router: sockets"] = sockets_of(router)
+        reported["coec: unwell before it runs"] = vehicle.health("coec")
         for configuration in story.configurations:
             note_sockets(vehicle, configuration)
         drive = rendered(SHORT)
         configure(drive.recording, story.networks)
         with (
             connected(["tcp/127.0.0.1:7447"], PATIENCE_S) as session,
-            listening(NOTIFY_SOCKET) as told,
+            listening(NOTIFY_SOCKET) as report,
             vehicle.running("coec") as process,
         ):
             service = Service(process, session, load_config(CONFIGURATION), Path("/var/log/coec.log"))
             with vehicle.running("observer") as observer:
                 service.until(service.status, lambda status: status["state"] == "running", "a warm worker")
-                begun_s = time.monotonic()
+                started_s = time.monotonic()
                 service.send(drive.frames)
-                said["solved"] = calibrated(service)
-                said["answers"] = questions(service)
-                said["viewer"] = rights_of_viewer(service)
-                said["coec: health"] = vehicle.health("coec")
-                said["observer: health"] = vehicle.health("observer")
-                said["observer: sockets"] = sockets_of(observer)
-                said["coec: sockets"] = sockets_of(process)
-                said["users"] = sorted({psutil.Process(pid).username() for pid in family(process)})
-                said["capabilities"] = sorted({capabilities(pid) for pid in family(process)})
+                reported["solved"] = calibrated(service)
+                reported["answers"] = requests(service)
+                reported["viewer"] = rights_of_viewer(service)
+                reported["coec: health"] = vehicle.health("coec")
+                reported["observer: health"] = vehicle.health("observer")
+                reported["observer: sockets"] = sockets_of(observer)
+                reported["coec: sockets"] = sockets_of(process)
+                reported["users"] = sorted({psutil.Process(pid).username() for pid in family(process)})
+                reported["capabilities"] = sorted({capabilities(pid) for pid in family(process)})
                 programs = {"router": router, "coec": process, "observer": observer}
-                said["memory"] = {name: resident(program) for name, program in programs.items()}
-                time.sleep(max(0.0, story.settle_s - (time.monotonic() - begun_s)))
-                said["lived_s"] = time.monotonic() - begun_s
+                reported["memory"] = {name: resident(program) for name, program in programs.items()}
+                time.sleep(max(0.0, story.settle_s - (time.monotonic() - started_s)))
+                reported["lived_s"] = time.monotonic() - started_s
                 vehicle.stop("coec", process)
                 wait_until(lambda: '"value":false' in Path("/var/log/observer.log").read_text(), "its word", PATIENCE_S)
                 vehicle.stop("observer", observer)
-            said["manager: told"] = list(dict.fromkeys(told))
-        said["observer: heard"] = heard(Path("/var/log/observer.log"))
+            reported["manager: told"] = list(dict.fromkeys(report))
+        reported["observer: heard"] = received(Path("/var/log/observer.log"))
         vehicle.stop("router", router)
 
 
@@ -267,7 +271,7 @@ def note_sockets(vehicle: Vehicle, configuration: str, *more: str) -> None:
         wait_until(
             lambda: lives(process) and vehicle.health("coec") == 0, f"the service of {configuration}", PATIENCE_S
         )
-        table = vehicle.said.setdefault("sockets by configuration", {})
+        table = vehicle.reported.setdefault("sockets by configuration", {})
         table[" ".join((configuration, *more))] = sockets_of(process)
         vehicle.stop("coec", process)
 
@@ -304,32 +308,32 @@ def decision_of(service: Service, pair: str) -> str:
     """About the window that is taken now."""
 
     def calibrate() -> Any:
-        return service.ask(service.keys.command(pair, "calibrate"))
+        return service.query(service.keys.command(pair, "calibrate"))
 
     def history() -> Any:
-        return service.ask(service.keys.history(pair))
+        return service.query(service.keys.history(pair))
 
-    service.until(calibrate, lambda told: bool(told["accepted"]), f"a window of {pair}")
-    told = service.until(history, lambda told: told["total"] > 0, f"a solve of {pair}")
-    return str(told["results"][0]["verdict"]["decision"])
+    service.until(calibrate, lambda report: bool(report["accepted"]), f"a window of {pair}")
+    report = service.until(history, lambda report: report["total"] > 0, f"a solve of {pair}")
+    return str(report["results"][0]["verdict"]["decision"])
 
 
-def questions(service: Service) -> dict[str, str]:
+def requests(service: Service) -> dict[str, str]:
     """Asks for everything that there is; what came of each."""
     keys, pair = service.keys, service.pair
     (window, *_) = service.windows()
-    asked = [
+    requested = [
         keys.status, keys.config, keys.metrics, keys.extrinsic(pair), keys.health(pair), keys.history(pair),
         keys.windows(pair), keys.window(pair, window["window_id"]), keys.overlay(pair), keys.evidence(pair),
     ]  # fmt: skip
     answers: dict[str, str] = {}
-    for key in asked:
+    for key in requested:
 
-        def told(key: str = key) -> bool:
+        def report(key: str = key) -> bool:
             answers[key] = answer_of(service, key)
-            return answers[key] not in ASK_AGAIN
+            return answers[key] not in QUERY_AGAIN
 
-        wait_until(told, f"an answer to {key}", PATIENCE_S)
+        wait_until(report, f"an answer to {key}", PATIENCE_S)
     return answers
 
 
@@ -337,12 +341,12 @@ def rights_of_viewer(service: Service) -> dict[str, str]:
     """What comes of a question and of a command from whoever has the observer's certificate and key."""
     keys, pair = service.keys, service.pair
     (file,) = [Path(word) for word in compose()["observer"]["command"] if word.endswith(".json5")]
-    found = {}
+    result = {}
     with connected_by(service_address(None, None, None, None, file).way, PATIENCE_S) as viewer:
         for name, key in (("health", keys.health(pair)), ("command", keys.command(pair, "hold"))):
             replies = query_all(viewer, key, PATIENCE_S)
-            found[name] = "answered" if replies else "nothing"
-    return found
+            result[name] = "answered" if replies else "nothing"
+    return result
 
 
 def answer_of(service: Service, key: str) -> str:
@@ -382,25 +386,25 @@ def capabilities(pid: int) -> str:
     return " ".join(f"{name} {int(fields[name], 16):x}" for name in ("CapPrm", "CapEff", "CapBnd", "NoNewPrivs"))
 
 
-def heard(log: Path) -> dict[str, list[str]]:
+def received(log: Path) -> dict[str, list[str]]:
     """What the observer has written, by kind: of health its state, of presence whether the pair is served."""
-    found: dict[str, list[str]] = {}
+    result: dict[str, list[str]] = {}
     for line in log.read_text().splitlines():
         document = json.loads(line)
         kind, value = str(document["key"]).rpartition("/")[2], document["value"]
         essence = {"health": "state", "extrinsic": "status"}.get(kind)
-        found.setdefault(kind, []).append(str(value if essence is None else value[essence]))
-    return found
+        result.setdefault(kind, []).append(str(value if essence is None else value[essence]))
+    return result
 
 
-def ended(command: Sequence[str]) -> int:
+def finished(command: Sequence[str]) -> int:
     """Exit status of a command of this checkout, with its optional extras."""
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY / "service")}
     whole = [sys.executable, "-m", *command]
     return subprocess.run(whole, env=environment, stdout=sys.stderr, cwd="/tmp").returncode
 
 
-def told_all() -> None:
+def reported_all() -> None:
     """What the programs have said, for whoever looks for a fault."""
     for log in Path("/var/log").glob("*.log"):
         if log.stem in compose():
@@ -411,5 +415,5 @@ if __name__ == "__main__":
     try:
         main(Story(**json.loads(sys.argv[1])))
     except BaseException:
-        told_all()
+        reported_all()
         raise

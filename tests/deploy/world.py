@@ -62,8 +62,8 @@ class World:
     """
 
     packets: Counter[Flow] = field(default_factory=Counter)
-    names_asked: list[str] = field(default_factory=list)
-    told: list[bytes] = field(default_factory=list)
+    names_requested: list[str] = field(default_factory=list)
+    reported: list[bytes] = field(default_factory=list)
     unseen: int = 0
 
     def strangers(self, router: Iterable[tuple[str, int]]) -> dict[str, int]:
@@ -95,9 +95,9 @@ def watched() -> Iterator[World]:
     names = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     names.bind((NAME_SERVER, DNS))
     listener = socket.create_server(("", HTTPS), family=socket.AF_INET6, dualstack_ipv6=True)
-    ended = threading.Event()
+    finished = threading.Event()
     tasks = ((_see, sniffer), (_answer_names, names), (_listen, listener))
-    threads = [threading.Thread(target=task, args=(ended, sock, world), daemon=True) for task, sock in tasks]
+    threads = [threading.Thread(target=task, args=(finished, sock, world), daemon=True) for task, sock in tasks]
     for _, sock in tasks:
         sock.settimeout(0.2)
     for thread in threads:
@@ -105,15 +105,15 @@ def watched() -> Iterator[World]:
     try:
         yield world
     finally:
-        ended.set()
+        finished.set()
         for thread in threads:
             thread.join()
         for _, sock in tasks:
             sock.close()
 
 
-def _see(ended: threading.Event, sniffer: socket.socket, world: World) -> None:
-    while not ended.is_set():
+def _see(finished: threading.Event, sniffer: socket.socket, world: World) -> None:
+    while not finished.is_set():
         with suppress(TimeoutError):
             data, (_, protocol, kind, *_) = sniffer.recvfrom(128)
             if kind == PACKET_OUTGOING:
@@ -138,8 +138,8 @@ def flow_of(protocol: int, data: bytes) -> Flow:
     return Flow(name, source, source_port, target, target_port)
 
 
-def _answer_names(ended: threading.Event, names: socket.socket, world: World) -> None:
-    while not ended.is_set():
+def _answer_names(finished: threading.Event, names: socket.socket, world: World) -> None:
+    while not finished.is_set():
         with suppress(TimeoutError):
             question, sender = names.recvfrom(512)
             labels, at = [], 12
@@ -147,33 +147,33 @@ def _answer_names(ended: threading.Event, names: socket.socket, world: World) ->
                 labels.append(question[at + 1 : at + 1 + question[at]].decode("ascii", "replace"))
                 at += 1 + question[at]
             (kind,) = struct.unpack_from(">H", question, at + 1)
-            world.names_asked.append(".".join(labels))
-            found = struct.pack(">HHHLH4s", 0xC00C, 1, 1, 60, 4, socket.inet_aton(EVERYBODY)) if kind == 1 else b""
-            counts = struct.pack(">HHHHH", 0x8180, 1, 1 if found else 0, 0, 0)
-            names.sendto(question[:2] + counts + question[12 : at + 5] + found, sender)
+            world.names_requested.append(".".join(labels))
+            result = struct.pack(">HHHLH4s", 0xC00C, 1, 1, 60, 4, socket.inet_aton(EVERYBODY)) if kind == 1 else b""
+            counts = struct.pack(">HHHHH", 0x8180, 1, 1 if result else 0, 0, 0)
+            names.sendto(question[:2] + counts + question[12 : at + 5] + result, sender)
 
 
-def _listen(ended: threading.Event, listener: socket.socket, world: World) -> None:
-    while not ended.is_set():
+def _listen(finished: threading.Event, listener: socket.socket, world: World) -> None:
+    while not finished.is_set():
         with suppress(TimeoutError, ConnectionError):
             caller, _ = listener.accept()
             with caller:
                 caller.settimeout(1.0)
-                world.told.append(caller.recv(4096))
+                world.reported.append(caller.recv(4096))
 
 
 def open_sockets(pids: Iterable[int]) -> set[str]:
     """What these processes listen on, as `tcp 127.0.0.1:7447`, and which UDP ports they have, whoever they are for."""
     owned = {inode for pid in pids for inode in _inodes(pid)}
-    found = set()
+    result = set()
     for name in ("tcp", "tcp6", "udp", "udp6", "raw", "raw6"):
         for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]:
             fields = line.split()
             local, state, inode = fields[1], fields[3], fields[9]
             if inode in owned and (not name.startswith("tcp") or state == TCP_LISTEN):
                 address, _, port = local.partition(":")
-                found.add(f"{name.removesuffix('6')} {_address(address)}:{int(port, 16)}")
-    return found
+                result.add(f"{name.removesuffix('6')} {_address(address)}:{int(port, 16)}")
+    return result
 
 
 def _inodes(pid: int) -> Iterator[str]:
@@ -186,7 +186,7 @@ def _inodes(pid: int) -> Iterator[str]:
 
 def _address(hexadecimal: str) -> str:
     """As the kernel writes them: words of 32 bits in the byte order of the machine."""
-    words = [int(hexadecimal[at : at + 8], 16) for at in range(0, len(hexadecimal), 8)]
-    packed = struct.pack(f"={len(words)}I", *words)
+    text = [int(hexadecimal[at : at + 8], 16) for at in range(0, len(hexadecimal), 8)]
+    packed = struct.pack(f"={len(text)}I", *text)
     address = ipaddress.ip_address(packed)
     return f"[{address}]" if address.version == 6 else str(address)

@@ -23,7 +23,7 @@ class Step:
     instruction: str
     text: str
 
-    def words(self) -> list[str]:
+    def labels(self) -> list[str]:
         """Of a list in JSON, or as a shell splits them."""
         return list(json.loads(self.text)) if self.text.startswith("[") else shlex.split(self.text)
 
@@ -43,31 +43,31 @@ class Stage:
     @property
     def environment(self) -> dict[str, str]:
         """What its ENV sets."""
-        return dict(word.split("=", 1) for step in self.steps if step.instruction == "ENV" for word in step.words())
+        return dict(word.split("=", 1) for step in self.steps if step.instruction == "ENV" for word in step.labels())
 
     @property
     def health_check(self) -> list[str]:
         """The command of HEALTHCHECK."""
         text = self.last("HEALTHCHECK").text
-        return Step("CMD", text[text.index("CMD ") + len("CMD ") :].strip()).words()
+        return Step("CMD", text[text.index("CMD ") + len("CMD ") :].strip()).labels()
 
 
 def stages() -> list[Stage]:
     """Of the Dockerfile, in order."""
     arguments: dict[str, str] = {}
-    found: list[Stage] = []
+    result: list[Stage] = []
     for step in steps((REPOSITORY / "Dockerfile").read_text()):
-        if step.instruction == "ARG" and not found:
+        if step.instruction == "ARG" and not result:
             name, _, value = step.text.partition("=")
             arguments[name] = value
         elif step.instruction == "FROM":
-            image, *named = step.words()
+            image, *named = step.labels()
             for name, value in arguments.items():
                 image = image.replace(f"${{{name}}}", value)
-            found.append(Stage(image, named[1] if named else None, []))
+            result.append(Stage(image, named[1] if named else None, []))
         else:
-            found[-1] = Stage(found[-1].image, found[-1].name, [*found[-1].steps, step])
-    return found
+            result[-1] = Stage(result[-1].image, result[-1].name, [*result[-1].steps, step])
+    return result
 
 
 def steps(text: str) -> list[Step]:
@@ -85,15 +85,15 @@ def compose() -> Mapping[str, Any]:
 
 def unit() -> Mapping[str, list[str]]:
     """The settings of the unit's [Service], each with all its values in order."""
-    found: dict[str, list[str]] = {}
+    result: dict[str, list[str]] = {}
     section = ""
     for line in (DEPLOY / "coec.service").read_text().splitlines():
         if line.startswith("["):
             section = line.strip("[]")
         elif section == "Service" and line and not line.startswith("#"):
             name, _, value = line.partition("=")
-            found.setdefault(name, []).append(value)
-    return found
+            result.setdefault(name, []).append(value)
+    return result
 
 
 def exec_start() -> list[str]:
@@ -104,8 +104,8 @@ def exec_start() -> list[str]:
 
 def shipped_configurations() -> list[str]:
     """The service's, by their path below the root of the checkout."""
-    found = [DEPLOY / "coec.yaml", DEPLOY / "ros2" / "coec.yaml", *sorted((DEPLOY / "examples").glob("*.yaml"))]
-    return [path.relative_to(REPOSITORY).as_posix() for path in found]
+    result = [DEPLOY / "coec.yaml", DEPLOY / "ros2" / "coec.yaml", *sorted((DEPLOY / "examples").glob("*.yaml"))]
+    return [path.relative_to(REPOSITORY).as_posix() for path in result]
 
 
 def documented_sockets() -> dict[str, list[str]]:

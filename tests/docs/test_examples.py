@@ -25,11 +25,11 @@ READERS: dict[str, Callable[[Any], object]] = {
 
 
 def examples() -> list[tuple[str, int, str]]:
-    found = []
+    result = []
     for path in sorted((REPOSITORY / "docs").glob("*.md")):
         for index, part in enumerate(path.read_text(encoding="utf-8").split("```yaml\n")[1:]):
-            found.append((path.stem, index, part.partition("```")[0]))
-    return found
+            result.append((path.stem, index, part.partition("```")[0]))
+    return result
 
 
 @pytest.mark.parametrize(("page", "index", "text"), examples())

@@ -53,7 +53,7 @@ def test_every_way_to_end_is_in_the_table() -> None:
 
 def reasons_made() -> set[str]:
     """Codes of the reasons that the service makes itself, as they stand in its source."""
-    found: set[str] = set()
+    result: set[str] = set()
     for path in (
         PACKAGE / "daemon.py",
         PACKAGE / "io/disk_writer.py",
@@ -74,17 +74,17 @@ def reasons_made() -> set[str]:
             code = node.args[0] if node.args else next(one.value for one in node.keywords if one.arg == "code")
             value = code.value if isinstance(code, ast.Constant) else named.get(getattr(code, "id", ""))
             if isinstance(value, str):
-                found.add(value)
-    return found
+                result.add(value)
+    return result
 
 
 def _called(function: ast.expr) -> str:
     return function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
 
 
-def test_every_trouble_is_in_the_table_with_what_to_do() -> None:
+def test_every_problem_is_in_the_table_with_what_to_do() -> None:
     made = reasons_made() - OF_A_JOB - {"internal_error"}
     assert made | COMPOSED | {NOT_INSTALLED.code} == set(PROBLEMS), (
         "a row of coec.service.api.problems for each, and none for others"
     )
-    assert all(trouble.meaning and trouble.advice for trouble in PROBLEMS.values())
+    assert all(problem.meaning and problem.advice for problem in PROBLEMS.values())

@@ -30,10 +30,10 @@ def page(name: str) -> str:
 
 
 # ------------------------------------------------------------------------------------------------ command line
-def leaves(command: Any, words: str) -> Iterator[tuple[str, Any]]:
+def leaves(command: Any, labels: str) -> Iterator[tuple[str, Any]]:
     for name, child in getattr(command, "commands", {}).items():
-        yield f"{words} {name}", child
-        yield from leaves(child, f"{words} {name}")
+        yield f"{labels} {name}", child
+        yield from leaves(child, f"{labels} {name}")
 
 
 def sections() -> dict[str, str]:
@@ -48,8 +48,8 @@ def test_every_option_of_every_command_stands_there_once() -> None:
     for name, command in tree.items():
         options = [opt for one in command.params for opt in (*one.opts, *one.secondary_opts) if opt.startswith("--")]
         terms = re.findall(r"^`([^`]+)`\n:   ", shown.get(name, ""), flags=re.MULTILINE)
-        told = Counter(re.findall(r"--[a-z0-9-]+", " ".join(terms)))
-        assert told == Counter(options), name
+        reported = Counter(re.findall(r"--[a-z0-9-]+", " ".join(terms)))
+        assert reported == Counter(options), name
         assert len(terms) == len(command.params), name
         assert [one.name for one in command.params if not one.help] == [], name
     groups = {name for name, command in tree.items() if getattr(command, "commands", None)}
@@ -57,8 +57,8 @@ def test_every_option_of_every_command_stands_there_once() -> None:
 
 
 def test_the_commands_of_the_picture_are_those_that_there_are() -> None:
-    drawn = re.findall(r'<text class="c"[^>]*>([^<]+)</text>', page("images/commands.svg"))
-    named = Counter(word for text in drawn for word in text.split(", "))
+    rendered = re.findall(r'<text class="c"[^>]*>([^<]+)</text>', page("images/commands.svg"))
+    named = Counter(word for text in rendered for word in text.split(", "))
     assert named == Counter(list(typer.main.get_command(application(())).commands))  # type: ignore[attr-defined]
 
 
@@ -96,10 +96,10 @@ def test_every_key_that_only_a_rig_has_stands_there_once() -> None:
     every = set(keys(RigConfig))
     assert set(shown) <= every
     # What is left out stands in the plain form, with the same name at the end.
-    said = {
+    stated = {
         name for model in (OpenCameraConfig, OpenLidarConfig, OpenEgoConfig, RigStages) for name in model.model_fields
     }
-    assert {key for key in every - set(shown) if not said & set(re.split(r"\W+", key))} == {"links"} | {
+    assert {key for key in every - set(shown) if not stated & set(re.split(r"\W+", key))} == {"links"} | {
         key for key in every if key.startswith("links[]")
     }
 
@@ -131,7 +131,7 @@ def test_a_key_has_its_default_unit_and_range(key: str, default: str, unit: str,
 
 
 # ------------------------------------------------------------------------------------------------- keys, schemas
-def test_every_key_that_can_be_asked_for_is_told() -> None:
+def test_every_key_that_can_be_requested_is_reported() -> None:
     built = Keys("p", "v")
     names = [name for name in vars(Keys) if not name.startswith("_") and name not in ("prefix", "vehicle", "root")]
     arguments = {"pair": "<pair>", "window_id": "<id>", "event_id": "<id>", "name": "<name>"}
@@ -139,20 +139,20 @@ def test_every_key_that_can_be_asked_for_is_told() -> None:
     for name in names:
         made = getattr(built, name)
         if callable(made):
-            wanted = made.__code__.co_varnames[1 : made.__code__.co_argcount]
-            if not set(wanted) <= set(arguments):
+            expected = made.__code__.co_varnames[1 : made.__code__.co_argcount]
+            if not set(expected) <= set(arguments):
                 continue  # the claim of a daemon, and what reads keys
-            made = made(*(arguments[one] for one in wanted))
+            made = made(*(arguments[one] for one in expected))
         assert f"`{made.replace('p/@v1/v/', '…/')}`" in text, name
 
 
-def test_every_message_is_told_with_its_fields() -> None:
+def test_every_message_is_reported_with_its_fields() -> None:
     text = page("schemas.md")
     for message in MESSAGES:
         name = message.__name__
-        found = re.search(rf"^## {name} .*?(?=^## |\Z)", text, flags=re.MULTILINE | re.DOTALL)
-        assert found is not None, name
-        assert shown_keys(found[0]) == Counter(list(message.model_fields)), name
+        result = re.search(rf"^## {name} .*?(?=^## |\Z)", text, flags=re.MULTILINE | re.DOTALL)
+        assert result is not None, name
+        assert shown_keys(result[0]) == Counter(list(message.model_fields)), name
 
 
 def error_codes(*packages: str) -> set[str]:
@@ -161,6 +161,6 @@ def error_codes(*packages: str) -> set[str]:
     return {code for text in source for code in re.findall(r'^    reply_code = "([a-z_]+)"', text, flags=re.MULTILINE)}
 
 
-def test_every_error_code_is_told() -> None:
-    _, _, told = page("keys.md").partition("## Error codes")
-    assert shown_keys(told) == Counter(error_codes("coec", "coec_lab"))
+def test_every_error_code_is_reported() -> None:
+    _, _, reported = page("keys.md").partition("## Error codes")
+    assert shown_keys(reported) == Counter(error_codes("coec", "coec_lab"))

@@ -95,7 +95,7 @@ COMMON = {"NotFoundError", "not_found", "is_not_found"}
 """Terms that hold a refused word."""
 
 
-def words_of(name: str) -> set[str]:
+def text_of(name: str) -> set[str]:
     return {word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)}
 
 
@@ -110,15 +110,15 @@ def defined_names(tree: ast.AST) -> Iterator[str]:
 
 def refused_names(source: str, permitted: set[str]) -> set[str]:
     names = set(defined_names(ast.parse(source))) - permitted - COMMON
-    return {name for name in names if words_of(name) & REFUSED.keys()}
+    return {name for name in names if text_of(name) & REFUSED.keys()}
 
 
-@pytest.mark.parametrize("folder", ["service", "docs/generate"])
+@pytest.mark.parametrize("folder", ["service", "docs/generate", "tests"])
 def test_names_are_terms_of_the_field(folder: str) -> None:
     for path in sorted((REPOSITORY / folder).rglob("*.py")):
         place = path.relative_to(REPOSITORY).as_posix()
         refused = refused_names(path.read_text(encoding="utf-8"), WIRE.get(place, set()))
-        hints = {name: [REFUSED[word] for word in words_of(name) & REFUSED.keys()] for name in refused | {path.stem}}
+        hints = {name: [REFUSED[word] for word in text_of(name) & REFUSED.keys()] for name in refused | {path.stem}}
         assert not {name: hint for name, hint in hints.items() if hint}, place
 
 

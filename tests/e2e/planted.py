@@ -41,7 +41,7 @@ def plant(config: Path, router: Router, authority: TestAuthority) -> list[bytes]
     return [text.encode() for text in (IN_FILE, REACHED, AWAY, USER, *(lines[1] for lines in keys))]
 
 
-def said(running: Service) -> Iterator[bytes]:
+def reported(running: Service) -> Iterator[bytes]:
     """All that the service answers: right questions, in both formats, and wrong ones."""
     keys: Keys = running.keys
     pair = running.pair
@@ -59,7 +59,7 @@ def _of_pair(running: Service) -> Iterator[str]:
     yield from ("extrinsic", "health", "history", "windows", "evidence", "overlay", "command/hold")
     for window in running.windows():
         yield f"windows/{window['window_id']}"
-    for event in running.ask(running.keys.evidence(running.pair))["events"]:
+    for event in running.query(running.keys.evidence(running.pair))["events"]:
         yield f"evidence/{event['event_id']}"
 
 

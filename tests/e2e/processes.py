@@ -95,8 +95,8 @@ def coec_here(*arguments: object) -> subprocess.CompletedProcess[str]:
             status = main()
     finally:
         sys.argv = before
-    said = [stream.buffer.getvalue().decode() for stream in (out, err)]
-    return subprocess.CompletedProcess(command, status, *said)
+    reported = [stream.buffer.getvalue().decode() for stream in (out, err)]
+    return subprocess.CompletedProcess(command, status, *reported)
 
 
 def free_endpoint() -> str:
@@ -188,7 +188,7 @@ class Service:
     def pair(self) -> str:
         return self.config.every_pair[0].name
 
-    def ask(self, key: str, parameters: str = "", payload: bytes | None = None) -> Any:
+    def query(self, key: str, parameters: str = "", payload: bytes | None = None) -> Any:
         """The document of a query for one key; `parameters` as `;name=value`.
 
         Raises:
@@ -197,27 +197,27 @@ class Service:
         return json.loads(query_one(self.session, f"{key}?format=json{parameters}", PATIENCE_S, payload).payload)
 
     def extrinsic(self) -> Any:
-        return self.ask(self.keys.extrinsic(self.pair))
+        return self.query(self.keys.extrinsic(self.pair))
 
     def health(self) -> Any:
-        return self.ask(self.keys.health(self.pair))
+        return self.query(self.keys.health(self.pair))
 
     def history(self) -> Any:
         """All that is kept: the newest hundred of each kind are told unless more are asked for."""
-        return self.ask(self.keys.history(self.pair), ";limit=1000")
+        return self.query(self.keys.history(self.pair), ";limit=1000")
 
     def windows(self) -> list[Any]:
-        found: list[Any] = self.ask(self.keys.windows(self.pair))["windows"]
-        return found
+        result: list[Any] = self.query(self.keys.windows(self.pair))["windows"]
+        return result
 
     def snippets(self) -> list[Any]:
         """What is kept of the seconds around events."""
-        found: list[Any] = self.ask(self.keys.windows(self.pair))["snippets"]
-        return found
+        result: list[Any] = self.query(self.keys.windows(self.pair))["snippets"]
+        return result
 
     def status(self) -> Any:
         """Of the service."""
-        return self.ask(self.keys.status)
+        return self.query(self.keys.status)
 
     def counters(self) -> Any:
         """Of the pair."""
@@ -232,9 +232,9 @@ class Service:
 
     def command(self, name: str, payload: bytes | None = None) -> Any:
         """The acknowledgement."""
-        return self.ask(self.keys.command(self.pair, name), payload=payload)
+        return self.query(self.keys.command(self.pair, name), payload=payload)
 
-    def until(self, ask: Callable[[], Any], condition: Callable[[Any], bool], what: str) -> Any:
+    def until(self, query: Callable[[], Any], condition: Callable[[Any], bool], what: str) -> Any:
         """The first answer that fulfils the condition: asked again when the service has published a change, and soon in
         any case.
 
@@ -245,7 +245,7 @@ class Service:
             self.changed.clear()
             answer = None
             with suppress(NotFoundError):  # who is announced may not be reached yet, as routes are still being laid
-                answer = ask()
+                answer = query()
             if answer is not None and condition(answer):
                 return answer
             assert self.process.poll() is None, f"the service ended ({self.process.returncode}), before: {what}"
@@ -343,10 +343,12 @@ def service(
     try:
         with nullcontext(router.session) if router else connected(loaded.zenoh.listen, PATIENCE_S) as session:
             running = Service(process, session, loaded, log)
-            with _told_of_changes(running):
+            with _reported_of_changes(running):
                 _await_alive(running)
-                wanted = ("running",) if warm else ("starting", "running", "failing")
-                running.until(running.status, lambda status: status["state"] in wanted, f"a service that is {wanted}")
+                expected = ("running",) if warm else ("starting", "running", "failing")
+                running.until(
+                    running.status, lambda status: status["state"] in expected, f"a service that is {expected}"
+                )
                 yield running
     except BaseException:
         sys.stderr.write(log.read_text()[-LOG_SHOWN:])
@@ -357,14 +359,14 @@ def service(
 
 
 @contextmanager
-def _told_of_changes(running: Service) -> Iterator[None]:
+def _reported_of_changes(running: Service) -> Iterator[None]:
     """Sets `changed` for everything that the service publishes of its pairs."""
 
-    def heard(_: zenoh.Sample) -> None:
+    def received(_: zenoh.Sample) -> None:
         running.changed.set()
 
     subscribers = [
-        running.session.declare_subscriber(key, zenoh.handlers.Callback(heard, indirect=False))
+        running.session.declare_subscriber(key, zenoh.handlers.Callback(received, indirect=False))
         for key in (running.keys.extrinsic("*"), running.keys.health("*"))
     ]
     try:
@@ -378,12 +380,12 @@ def _await_alive(running: Service) -> None:
     """Until every pair is announced, or the process has ended."""
     missing = {running.keys.alive(pair.name) for pair in running.config.every_pair}
 
-    def heard(token: zenoh.Sample) -> None:
+    def received(token: zenoh.Sample) -> None:
         if token.kind == zenoh.SampleKind.PUT:
             missing.discard(str(token.key_expr))
             running.changed.set()
 
-    handler = zenoh.handlers.Callback(heard, indirect=False)
+    handler = zenoh.handlers.Callback(received, indirect=False)
     tokens = running.session.liveliness().declare_subscriber(running.keys.alive("*"), handler, history=True)
     deadline_s = time.monotonic() + PATIENCE_S
     try:

@@ -76,13 +76,15 @@ class Street:
 
     def frames_of(self, knock: Knock | None) -> list[Frame]:
         """In the order of their stamps."""
-        found = dict(_as_built(self))
+        result = dict(_as_built(self))
         if knock is not None:
             moved = self.drive_of(None).stream(knock.sensor)
-            after = [e for e in found if e.stream == moved and second_of(e.stamp_ns) >= self.knock_s]
+            after = [e for e in result if e.stream == moved and second_of(e.stamp_ns) >= self.knock_s]
             config = self.config_of(knock)
-            found |= zip(after, cached_messages((*self.name, knock, after), lambda: drawn(config, after)), strict=True)
-        return sorted(found.values(), key=lambda frame: frame.stamp_ns)
+            result |= zip(
+                after, cached_messages((*self.name, knock, after), lambda: rendered(config, after)), strict=True
+            )
+        return sorted(result.values(), key=lambda frame: frame.stamp_ns)
 
     def truth(self, knock: Knock | None, camera: str, lidar: str, second: float) -> Matrix4:
         """True T_camera_lidar (4, 4)."""
@@ -118,7 +120,7 @@ def _as_built(street: Street) -> dict[Arrival, Frame]:
         sweeps = (instant.sweep, *(_nearest(drive, lidar, instant.sweep.stamp_ns) for lidar in street.lidars[1:]))
         entries |= dict.fromkeys((*sweeps, *instant.pictures.values(), *instant.motions))
     plan = list(entries)
-    return dict(zip(plan, cached_messages((*street.name, plan), lambda: drawn(config, plan)), strict=True))
+    return dict(zip(plan, cached_messages((*street.name, plan), lambda: rendered(config, plan)), strict=True))
 
 
 def _nearest(drive: RigDrive, lidar: str, stamp_ns: int) -> Arrival:
@@ -127,11 +129,11 @@ def _nearest(drive: RigDrive, lidar: str, stamp_ns: int) -> Arrival:
     return min((e for e in drive.plan if e.stream == stream), key=lambda entry: abs(entry.stamp_ns - stamp_ns))
 
 
-def drawn(config: RigDriveConfig, entries: Sequence[Arrival]) -> list[Frame]:
+def rendered(config: RigDriveConfig, entries: Sequence[Arrival]) -> list[Frame]:
     """By two processes, in the order of the entries."""
     parts = [entries[begin : begin + PART] for begin in range(0, len(entries), PART)]
     with ProcessPoolExecutor(2, get_context("spawn"), _open, (config,)) as pool:
-        return [frame for part in pool.map(_draw, parts) for frame in part]
+        return [frame for part in pool.map(_render, parts) for frame in part]
 
 
 _drive: RigDrive | None = None
@@ -142,6 +144,6 @@ def _open(config: RigDriveConfig) -> None:
     _drive = config.drive()
 
 
-def _draw(entries: Sequence[Arrival]) -> list[Frame]:
+def _render(entries: Sequence[Arrival]) -> list[Frame]:
     assert _drive is not None
     return [_drive.message(entry) for entry in entries]

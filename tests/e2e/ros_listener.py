@@ -21,8 +21,8 @@ _STORE = get_typestore(Stores.ROS2_JAZZY)
 
 def speaking_to_ros(path: Path, *publish: RosOutput) -> None:
     """Make a written configuration one of a service that publishes this on rmw_zenoh's keys, of domain 0."""
-    told = {"middleware": "rmw_zenoh", "ros": RosConfig(publish=publish)}
-    path.write_text(commented_yaml(load_config(path).model_copy(update=told)))
+    reported = {"middleware": "rmw_zenoh", "ros": RosConfig(publish=publish)}
+    path.write_text(commented_yaml(load_config(path).model_copy(update=reported)))
 
 
 @dataclass

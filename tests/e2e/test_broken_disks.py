@@ -19,7 +19,7 @@ from e2e.processes import Router, Service, service
 from soak.vehicle import POINTS, Vehicle, configured
 
 BROKEN_S = 16.0
-SAID_S = 5.0
+REPORTED_S = 5.0
 """Within which health names the disk."""
 
 UNHURRIED_S = 2.0
@@ -46,16 +46,16 @@ class Beats:
     """
 
     def __init__(self, address: Path) -> None:
-        self.heard_s: list[float] = []
+        self.received_s: list[float] = []
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(str(address))
         self._thread = threading.Thread(target=self._listen)
         self._thread.start()
 
     def _listen(self) -> None:
-        while told := self._socket.recv(100):
-            if told == b"WATCHDOG=1":
-                self.heard_s.append(time.monotonic())
+        while reported := self._socket.recv(100):
+            if reported == b"WATCHDOG=1":
+                self.received_s.append(time.monotonic())
 
     def close(self) -> None:
         self._socket.shutdown(socket.SHUT_RDWR)  # what is received then is empty
@@ -64,7 +64,7 @@ class Beats:
 
     def longest_s(self, begin_s: float) -> float:
         """Between two beats since then."""
-        since = [begin_s, *(heard_s for heard_s in self.heard_s if heard_s >= begin_s), time.monotonic()]
+        since = [begin_s, *(received_s for received_s in self.received_s if received_s >= begin_s), time.monotonic()]
         return max(after - before for before, after in pairwise(since))
 
 
@@ -84,9 +84,9 @@ def codes(running: Service) -> set[str]:
     return {reason["code"] for reason in running.health()["reasons"]}
 
 
-def named(found: set[str]) -> bool:
+def named(result: set[str]) -> bool:
     """Whether reasons name the disk."""
-    return any(code.startswith(("disk_", "recording_")) for code in found)
+    return any(code.startswith(("disk_", "recording_")) for code in result)
 
 
 def held(running: Service, *, release: bool) -> tuple[Any, float]:
@@ -133,10 +133,12 @@ def test_a_broken_disk_is_named_keeps_nobody_waiting_and_loses_nothing(
                 time.sleep(1.0)
             longest_s = beats.longest_s(broken_s)
             disk.becomes(WELL)
-            running.until(lambda: codes(running), lambda found: not named(found), "a disk that is well")
+            running.until(lambda: codes(running), lambda result: not named(result), "a disk that is well")
             recorded = running.counters()["windows"]
             running.until(running.counters, lambda pair: pair["windows"] > recorded, "another window")
-            running.until(lambda: held(running, release=False)[0], lambda told: told["durable"], "a durable command")
+            running.until(
+                lambda: held(running, release=False)[0], lambda reported: reported["durable"], "a durable command"
+            )
             before = running.history()
             running.kill()
     finally:
@@ -145,13 +147,13 @@ def test_a_broken_disk_is_named_keeps_nobody_waiting_and_loses_nothing(
     assert any(one["durable"] is False for one in commands), commands
     record_property("figure", f"{state}: named after {named_s:.1f} s, answers {1e3 * max(took_s):.0f} ms, "
                               f"beats {longest_s:.1f} s apart")  # fmt: skip
-    assert named_s < SAID_S
+    assert named_s < REPORTED_S
     assert max(took_s) < UNHURRIED_S
     assert longest_s < UNHURRIED_S
     with service(path, router, warm=False) as running:
         after = running.history()
-        told = [one["entry"]["code"] for one in after["entries"] if one["entry"]["kind"] == "command"]
-        assert len(told) >= len(commands)
+        reported = [one["entry"]["code"] for one in after["entries"] if one["entry"]["kind"] == "command"]
+        assert len(reported) >= len(commands)
         assert after["entries"][: len(before["entries"])] == before["entries"]
         assert not DAMAGE & codes(running)
         assert running.extrinsic()["held"] is True

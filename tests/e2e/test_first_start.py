@@ -58,9 +58,9 @@ def test_a_first_start_says_that_it_compiles_and_loses_no_window(
 
         def codes(health: Any) -> set[str]:
             """Those of the reasons of health, which are also noted."""
-            found = {reason["code"] for reason in health["reasons"]}
-            seen.update(found)
-            return found
+            result = {reason["code"] for reason in health["reasons"]}
+            seen.update(result)
+            return result
 
         def runs(status: Any) -> bool:
             codes(it.health())

@@ -40,7 +40,7 @@ each pass."""
 LONGEST_S = 5.0
 """From the first answer to the kill: on two idle cores the worker is warm after two of them."""
 
-ASK_PERIOD_S = 0.1
+QUERY_PERIOD_S = 0.1
 
 SNIPPET_BYTES = 64 * 2**20
 """Of memory; some seconds of the drive."""
@@ -50,21 +50,21 @@ DAMAGE = {"state_damaged", "history_damaged"}
 
 
 @dataclass
-class Told:
+class Reported:
     """What the service has told a client: of each question the last answer; and whether it is held, as far as the last
     acknowledgement says that this is on the disk."""
 
     answers: dict[str, Any] = field(default_factory=dict)
     held: bool | None = None
 
-    def ask(self, running: Service) -> None:
+    def query(self, running: Service) -> None:
         """Everything once."""
         keys, pair = running.keys, running.pair
         self.answers["extrinsic"] = running.extrinsic()
         self.answers["history"] = running.history()
         self.answers["windows"], self.answers["snippets"] = running.windows(), running.snippets()
-        events = running.ask(keys.evidence(pair))["events"]
-        self.answers["events"] = [running.ask(keys.evidence_of(pair, event["event_id"])) for event in events]
+        events = running.query(keys.evidence(pair))["events"]
+        self.answers["events"] = [running.query(keys.evidence_of(pair, event["event_id"])) for event in events]
 
     def hold(self, running: Service, *, release: bool) -> None:
         """Has the extrinsic held, or released."""
@@ -94,21 +94,21 @@ def lives(config: Path, router: Router, folder: Path, kills: int, seed: int) -> 
     """Kills a service under load so often, at seeded moments, and looks each time at what is left; seconds from start
     to first answer."""
     rng = np.random.default_rng(seed)
-    told = Told()
+    reported = Reported()
     starts_s = []
     for life in range(kills + 1):
         started_s = time.monotonic()
         with service(config, router, warm=False) as running:
             running.extrinsic()
             starts_s.append(time.monotonic() - started_s)
-            _check_nothing_is_lost(running, told, folder)
+            _check_nothing_is_lost(running, reported, folder)
             kill_s, command_s = (time.monotonic() + LONGEST_S * share for share in (rng.random(), rng.random()))
             while time.monotonic() < kill_s:
-                told.ask(running)
+                reported.query(running)
                 if time.monotonic() > command_s:
-                    told.hold(running, release=life % 2 > 0)
+                    reported.hold(running, release=life % 2 > 0)
                     command_s = kill_s
-                running.changed.wait(min(ASK_PERIOD_S, max(kill_s - time.monotonic(), 0.0)))
+                running.changed.wait(min(QUERY_PERIOD_S, max(kill_s - time.monotonic(), 0.0)))
                 running.changed.clear()
             running.kill()
             # A busy router notices late, and whom it still announces the next one does not join.
@@ -116,11 +116,11 @@ def lives(config: Path, router: Router, folder: Path, kills: int, seed: int) -> 
     return starts_s
 
 
-def _check_nothing_is_lost(running: Service, told: Told, folder: Path) -> None:
+def _check_nothing_is_lost(running: Service, reported: Reported, folder: Path) -> None:
     assert not DAMAGE & {reason["code"] for reason in running.health()["reasons"]}
     assert not DAMAGE & set(running.counters()["losses"])
-    before, now = told.answers, Told()
-    now.ask(running)
+    before, now = reported.answers, Reported()
+    now.query(running)
     after = now.answers
     if not before:
         return
@@ -140,16 +140,16 @@ def _check_nothing_is_lost(running: Service, told: Told, folder: Path) -> None:
     # What was served, or what was decided since, before anybody asked.
     poses = [before["extrinsic"]["camera_from_lidar"], *(one["entry"]["camera_from_lidar"] for one in fresh)]
     assert after["extrinsic"]["camera_from_lidar"] in poses
-    if told.held is not None:
-        assert after["extrinsic"]["held"] is told.held
+    if reported.held is not None:
+        assert after["extrinsic"]["held"] is reported.held
 
 
 def _check_windows(before: list[Any], now: dict[str, Any], folder: Path) -> None:
     for window in before:
-        kept = now[window["window_id"]]
-        counts = {kept["pairs"], window["pairs"], len(read_window(folder / f"{window['window_id']}.mcap")[0].pairs)}
-        assert len(counts - {None}) == 1, f"pairs of {window['window_id']}: {kept}, {window}"
-        assert window["decision"] in (None, kept["decision"])
+        retained = now[window["window_id"]]
+        counts = {retained["pairs"], window["pairs"], len(read_window(folder / f"{window['window_id']}.mcap")[0].pairs)}
+        assert len(counts - {None}) == 1, f"pairs of {window['window_id']}: {retained}, {window}"
+        assert window["decision"] in (None, retained["decision"])
 
 
 @pytest.fixture
@@ -172,7 +172,7 @@ def config(tmp_path: Path, router: Router) -> Path:
     "kill -9 at any moment under load, again and again", "nothing that was ever told to a client is lost"
 )
 @pytest.mark.parametrize(("kills", "seed"), [(2, 1), pytest.param(50, 2, marks=pytest.mark.slow)])
-def test_killed_at_any_moment_nothing_told_is_lost(
+def test_killed_at_any_moment_nothing_reported_is_lost(
     tmp_path: Path,
     router: Router,
     config: Path,

@@ -16,7 +16,7 @@ from e2e.processes import Router, Service, service
 from soak.vehicle import configured
 from support.windows import a_pair, a_window
 
-WINDOWS, ASKED = 5000, 50
+WINDOWS, REQUESTED = 5000, 50
 
 BEGIN_NS, PERIOD_NS = 1_700_000_000_000_000_000, 60_000_000_000
 
@@ -27,22 +27,22 @@ tells."""
 pytestmark = pytest.mark.slow
 
 
-def asked_s(running: Service) -> list[float]:
+def requested_s(running: Service) -> list[float]:
     """How long each of many lists took."""
     took_s = []
-    for _ in range(ASKED):
-        begun_s = time.monotonic()
+    for _ in range(REQUESTED):
+        opened_s = time.monotonic()
         assert len(running.windows()) == WINDOWS
-        took_s.append(time.monotonic() - begun_s)
+        took_s.append(time.monotonic() - opened_s)
     return took_s
 
 
 def started_s(path: Path, router: Router, then: Callable[[Service], None]) -> float:
     """From the start of a service to its first answer; what is to be done `then`, before it ends."""
-    begun_s = time.monotonic()
+    opened_s = time.monotonic()
     with service(path, router, warm=False) as running:
         running.extrinsic()
-        took_s = time.monotonic() - begun_s
+        took_s = time.monotonic() - opened_s
         then(running)
         assert running.terminate() == 0
     return took_s
@@ -72,10 +72,10 @@ def test_thousands_of_windows_cost_neither_the_start_nor_the_answers(
     for number in range(WINDOWS):
         (windows / f"front-{BEGIN_NS + number * PERIOD_NS}.mcap").write_bytes(data)
     took_s: list[float] = []
-    unknown_s = started_s(path, router, lambda running: took_s.extend(asked_s(running)))
+    unknown_s = started_s(path, router, lambda running: took_s.extend(requested_s(running)))
     all_read(windows)
     took_s.clear()
-    known_s = started_s(path, router, lambda running: took_s.extend(asked_s(running)))
+    known_s = started_s(path, router, lambda running: took_s.extend(requested_s(running)))
     middle_ms, worst_ms = 1e3 * statistics.median(took_s), 1e3 * max(took_s)
     record_property(
         "figure",

@@ -47,11 +47,11 @@ def test_memory_comes_back_after_a_burst(tmp_path: Path, router: Router, record_
         process = psutil.Process(running.process.pid)
         vehicle = Vehicle(router.session, 1)
         vehicle.start()
-        ended = threading.Event()
+        finished = threading.Event()
 
         def watch() -> None:
             nonlocal most
-            while not ended.wait(0.02):
+            while not finished.wait(0.02):
                 most = max(most, process.memory_info().rss)
 
         watcher = threading.Thread(target=watch)
@@ -64,11 +64,11 @@ def test_memory_comes_back_after_a_burst(tmp_path: Path, router: Router, record_
                 for stream in (CAMERA, LIDAR):
                     for payload in payloads:
                         vehicle.put(stream, payload)
-            begun_s = time.monotonic()
+            started_s = time.monotonic()
             wait_until(lambda: process.memory_info().rss < before + BACK_MIB * MIB, "the memory back", BACK_S)
-            back_s = time.monotonic() - begun_s
+            back_s = time.monotonic() - started_s
         finally:
-            ended.set()
+            finished.set()
             vehicle.stop()
         assert running.terminate() == 0
     figure = f"at most {(most - before) / MIB:+.0f} MiB, back within {BACK_MIB:g} MiB after {back_s:.0f} s"

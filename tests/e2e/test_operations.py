@@ -62,9 +62,9 @@ def page(port: int, path: str) -> tuple[int, str]:
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
     connection.request("GET", path, headers={"Accept": "application/openmetrics-text"})
     answer = connection.getresponse()
-    told = answer.status, answer.read().decode()
+    reported = answer.status, answer.read().decode()
     connection.close()
-    return told
+    return reported
 
 
 @pytest.mark.fault(
@@ -112,12 +112,12 @@ def test_who_may_give_commands_is_read_again(
 
         def after(signals: int) -> dict[str, Any]:
             running.process.send_signal(signal.SIGHUP)
-            told = running.until(
+            reported = running.until(
                 lambda: running.status()["configuration"],
-                lambda told: told["reloads"] == signals or told["refused"] is not None,
+                lambda reported: reported["reloads"] == signals or reported["refused"] is not None,
                 "the reload",
             )
-            return dict(told)
+            return dict(reported)
 
         def may_hold(by: TestAuthority | None) -> bool:
             try:
@@ -160,16 +160,16 @@ def _reload(running: Service, path: Path, endpoint: str, port: int) -> None:
     assert status["configuration"]["taken"] == ["metrics.http", f"pairs.{PAIR}.policy.apply"]
     assert status["configuration"]["waiting"] == ["worker.threads"]
     assert status["config_hash"] != before["config_hash"]
-    shown = running.ask(running.keys.config)
+    shown = running.query(running.keys.config)
     assert shown["config_hash"] == status["config_hash"]
     assert shown["config"]["pairs"][0]["policy"]["apply"] == "never"
     (entry,) = running.until(lambda: running.entries("command"), bool, "the entry of the history")
     assert (entry["code"], entry["sender"]) == ("reloaded", "SIGHUP")
     assert status["config_hash"] in entry["text"]
 
-    told, text = page(port, "/metrics")
+    reported, text = page(port, "/metrics")
     families = parse_open_metrics(text)
-    assert told == 200
+    assert reported == 200
     assert families["coec_query_seconds"].value("_count", resource="status") > 0
     assert page(port, "/live")[0] == 200
     assert page(port, "/health")[0] == 503, "nobody has looked yet"
@@ -189,8 +189,8 @@ def _reload(running: Service, path: Path, endpoint: str, port: int) -> None:
 
 def _examined(path: Path) -> None:
     """What the doctor finds beside the service."""
-    found = list(examine(path, 0.5))
-    first = {one.check: one for one in reversed(found)}
+    result = list(examine(path, 0.5))
+    first = {one.check: one for one in reversed(result)}
     assert first["service"].text.startswith("version ")
     assert (first["reload"].level, first["reload"].text) == ("warn", "waits for a restart: worker.threads")
     assert first["health"].level == "warn", "nobody has looked yet"

@@ -55,23 +55,27 @@ class Story:
     """All that the service published of the rig while it was driven, in order, and what it said in the end."""
 
     street: Street
-    told: list[RigReply]
+    reported: list[RigReply]
     last: RigReply
 
     @property
     def named(self) -> set[str]:
         """Sensors that were said to have moved, at any time."""
-        return set().union(*map(moved_in, self.told))
+        return set().union(*map(moved_in, self.reported))
 
     @property
     def corrections(self) -> list[RigCorrection]:
         """Those that were told, each once."""
-        found = [told.correction for told in (*self.told, self.last) if told.correction is not None]
-        return list({correction.stamp_ns: correction for correction in found}.values())
+        result = [reported.correction for reported in (*self.reported, self.last) if reported.correction is not None]
+        return list({correction.stamp_ns: correction for correction in result}.values())
 
     def named_s(self, sensor: str) -> float:
         """Seconds of driving between the knock and its being named."""
-        stamps = [told.stamp_ns for told in self.told if sensor in moved_in(told) and told.stamp_ns is not None]
+        stamps = [
+            reported.stamp_ns
+            for reported in self.reported
+            if sensor in moved_in(reported) and reported.stamp_ns is not None
+        ]
         return second_of(min(stamps)) - self.street.knock_s
 
     def turned_deg(self, sensor: str) -> float:
@@ -85,7 +89,7 @@ class Story:
     def lines(self) -> str:
         """What was said when, for who has to find out why it was not what it should be."""
         lines = []
-        for reply in (*self.told, self.last):
+        for reply in (*self.reported, self.last):
             states = {sensor.name: (sensor.state, sensor.probability) for sensor in reply.sensors}
             at_s = None if reply.stamp_ns is None else round(second_of(reply.stamp_ns), 1)
             lines.append(f"{at_s}: {states} {reply.looks} {reply.losses} {reply.correction}")
@@ -116,10 +120,10 @@ def driven(running: Service, street: Street, frames: list[Frame]) -> Story:
     """A second of driving at a time, each once the service has kept up; then until all is judged."""
     sensors = SensorKeys(tuple(sorted({frame.frame_id for frame in frames})))
     player = Player(running.session, sensors, "msgpack")
-    told, sent = [rig_of(running)], Counter[str]()
+    reported, sent = [rig_of(running)], Counter[str]()
 
-    def heard(sample: zenoh.Sample) -> None:
-        told.append(from_msgpack(RigReply, sample.payload.to_bytes()))
+    def received(sample: zenoh.Sample) -> None:
+        reported.append(from_msgpack(RigReply, sample.payload.to_bytes()))
 
     of_pair = {pair.name: (pair.camera.sensor, pair.lidar.sensor) for pair in running.config.pairs}
 
@@ -130,7 +134,7 @@ def driven(running: Service, street: Street, frames: list[Frame]) -> Story:
                 return False
         return all(pair["held"] < HELD for pair in status["pairs"])
 
-    published = running.session.declare_subscriber(running.keys.rig, zenoh.handlers.Callback(heard, indirect=False))
+    published = running.session.declare_subscriber(running.keys.rig, zenoh.handlers.Callback(received, indirect=False))
     try:
         assert not player.wait_for_listener(PATIENCE_S)
         for second in range(street.seconds + 1):
@@ -139,7 +143,7 @@ def driven(running: Service, street: Street, frames: list[Frame]) -> Story:
             sent.update(frame.frame_id for frame in part)
             running.until(running.status, taken, f"second {second} of the drive")
         rest(running)
-        return Story(street, told, rig_of(running))
+        return Story(street, reported, rig_of(running))
     finally:
         published.undeclare()
         player.close()
@@ -147,7 +151,7 @@ def driven(running: Service, street: Street, frames: list[Frame]) -> Story:
 
 def rig_of(running: Service) -> RigReply:
     """What it says of the rig now."""
-    return RigReply.model_validate(running.ask(running.keys.rig))
+    return RigReply.model_validate(running.query(running.keys.rig))
 
 
 def rest(running: Service) -> None:
@@ -169,29 +173,29 @@ def rest(running: Service) -> None:
 
 def errors_deg(running: Service, street: Street, knock: Knock | None) -> dict[str, float]:
     """Of what every pair serves, against the truth at the end of the drive."""
-    found = {}
+    result = {}
     for pair in running.config.pairs:
-        served = np.array(running.ask(running.keys.extrinsic(pair.name))["camera_from_lidar"]["matrix"])
+        served = np.array(running.query(running.keys.extrinsic(pair.name))["camera_from_lidar"]["matrix"])
         right = street.truth(knock, pair.camera.sensor, pair.lidar.sensor, street.seconds)
-        found[pair.name] = float(np.degrees(rotation_angle_rad(served @ inverse(right))))
-    return found
+        result[pair.name] = float(np.degrees(rotation_angle_rad(served @ inverse(right))))
+    return result
 
 
 def states_of(running: Service, pair: str) -> list[str]:
     """In which its health has been, by what was seen: a drive that is over makes pairs degraded by the clock."""
-    entries = [one["entry"] for one in running.ask(running.keys.history(pair), ";limit=1000")["entries"]]
+    entries = [one["entry"] for one in running.query(running.keys.history(pair), ";limit=1000")["entries"]]
     return [entry["code"] for entry in entries if entry["kind"] == "state" and entry["stamp_ns"] is not None]
 
 
 def reasons_of(running: Service) -> list[list[str]]:
     """Codes that the health of each pair gives now."""
-    healths = [running.ask(running.keys.health(pair.name)) for pair in running.config.pairs]
+    healths = [running.query(running.keys.health(pair.name)) for pair in running.config.pairs]
     return [[reason["code"] for reason in health["reasons"]] for health in healths]
 
 
 def corrected(running: Service, pair: str) -> int:
     """How often the rig put a pair right."""
-    entries = running.ask(running.keys.history(pair), ";limit=1000")["entries"]
+    entries = running.query(running.keys.history(pair), ";limit=1000")["entries"]
     return sum((one["entry"]["kind"], one["entry"]["code"]) == ("command", "corrected") for one in entries)
 
 
@@ -206,13 +210,13 @@ def test_a_right_rig_raises_no_alarm(
         cameras = FOUR_AND_ONE.drive_of(None).cameras
         assert {pair.name for pair in running.config.pairs} == set(cameras)
         story = driven(running, FOUR_AND_ONE, FOUR_AND_ONE.frames_of(None))
-        said = story.lines()
-        assert {sensor.state for sensor in story.told[0].sensors} == {"unknown"}
-        assert story.named == set(), said
-        assert story.corrections == [], said
-        assert story.last.move is None, said
-        assert {sensor.state for sensor in story.last.sensors} == {"calibrated"}, said
-        assert set(story.last.looks) == set(cameras), said
+        message = story.lines()
+        assert {sensor.state for sensor in story.reported[0].sensors} == {"unknown"}
+        assert story.named == set(), message
+        assert story.corrections == [], message
+        assert story.last.move is None, message
+        assert {sensor.state for sensor in story.last.sensors} == {"calibrated"}, message
+        assert set(story.last.looks) == set(cameras), message
         assert not any("miscalibrated" in states_of(running, camera) for camera in cameras)
         errors = errors_deg(running, FOUR_AND_ONE, None)
         record_property("figure", f"{sum(story.last.looks.values())} looks, ≤ {max(errors.values()):.2f}° off")
@@ -224,19 +228,19 @@ def test_a_right_rig_raises_no_alarm(
 @pytest.mark.fault(
     "the LiDAR of a running vehicle is knocked by 1.5°", "it alone is named, in a minute; one correction for all pairs"
 )
-def test_a_knocked_lidar_is_named_and_put_right_in_all_its_pairs_at_once(
+def test_a_displaced_lidar_is_named_and_put_right_in_all_its_pairs_at_once(
     tmp_path: Path, router: Router, record_property: Callable[[str, object], None]
 ) -> None:
     with service(configuration(FOUR_AND_ONE, tmp_path, router), router) as running:
         cameras = FOUR_AND_ONE.drive_of(ROOF).cameras
         story = driven(running, FOUR_AND_ONE, FOUR_AND_ONE.frames_of(ROOF))
-        said = story.lines()
-        assert story.named == {LIDAR}, said
-        assert story.turned_deg(LIDAR) == pytest.approx(ROOF.turn_deg, abs=MAX_ERROR_DEG), said
-        assert 0.0 < story.named_s(LIDAR) <= NAMED_S, said
+        message = story.lines()
+        assert story.named == {LIDAR}, message
+        assert story.turned_deg(LIDAR) == pytest.approx(ROOF.turn_deg, abs=MAX_ERROR_DEG), message
+        assert 0.0 < story.named_s(LIDAR) <= NAMED_S, message
         (correction,) = story.corrections
         assert correction.sensors == (LIDAR,)
-        assert set(correction.pairs) == set(cameras), said
+        assert set(correction.pairs) == set(cameras), message
         assert [corrected(running, camera) for camera in cameras] == [1] * len(cameras)
         errors = errors_deg(running, FOUR_AND_ONE, ROOF)
         put_right_s = second_of(correction.stamp_ns) - FOUR_AND_ONE.knock_s
@@ -246,7 +250,7 @@ def test_a_knocked_lidar_is_named_and_put_right_in_all_its_pairs_at_once(
             f"{max(errors.values()):.2f}° off at most",
         )
         assert max(errors.values()) <= MAX_ERROR_TOGETHER_DEG, errors
-        assert {sensor.state for sensor in story.last.sensors} == {"calibrated"}, said
+        assert {sensor.state for sensor in story.last.sensors} == {"calibrated"}, message
         last = {camera: states_of(running, camera)[-1] for camera in cameras}
         # A pair whose own looks lie beside what all say may find that they do not add up; none accuses its mount.
         assert set(last.values()) <= {"healthy", "degraded"}, last
@@ -257,16 +261,16 @@ def test_a_knocked_lidar_is_named_and_put_right_in_all_its_pairs_at_once(
 @pytest.mark.fault(
     "a camera of a running vehicle is knocked by 1.5°", "it alone is named, in a minute, and put right; no other alarm"
 )
-def test_a_knocked_camera_is_named_and_put_right_and_no_other(
+def test_a_displaced_camera_is_named_and_put_right_and_no_other(
     tmp_path: Path, router: Router, record_property: Callable[[str, object], None]
 ) -> None:
     with service(configuration(FOUR_AND_ONE, tmp_path, router), router) as running:
         others = set(FOUR_AND_ONE.drive_of(LEFT).cameras) - {LEFT.sensor}
         story = driven(running, FOUR_AND_ONE, FOUR_AND_ONE.frames_of(LEFT))
-        said = story.lines()
-        assert story.named == {LEFT.sensor}, said
-        assert story.turned_deg(LEFT.sensor) == pytest.approx(LEFT.turn_deg, abs=MAX_ERROR_DEG), said
-        assert 0.0 < story.named_s(LEFT.sensor) <= NAMED_S, said
+        message = story.lines()
+        assert story.named == {LEFT.sensor}, message
+        assert story.turned_deg(LEFT.sensor) == pytest.approx(LEFT.turn_deg, abs=MAX_ERROR_DEG), message
+        assert 0.0 < story.named_s(LEFT.sensor) <= NAMED_S, message
         assert not any("miscalibrated" in states_of(running, camera) for camera in others)
         errors = errors_deg(running, FOUR_AND_ONE, LEFT)
         record_property(
@@ -274,7 +278,7 @@ def test_a_knocked_camera_is_named_and_put_right_and_no_other(
             f"named {story.named_s(LEFT.sensor):.0f} s after the knock; then {errors[LEFT.sensor]:.2f}° off",
         )
         assert max(errors.values()) <= MAX_ERROR_DEG, errors
-        assert {sensor.state for sensor in story.last.sensors} == {"calibrated"}, said
+        assert {sensor.state for sensor in story.last.sensors} == {"calibrated"}, message
         assert states_of(running, LEFT.sensor)[-1] == "healthy"
         assert running.terminate() == 0
 
@@ -289,32 +293,32 @@ def test_three_lidars_that_see_each_other_are_measured_and_nobody_is_named(
 ) -> None:
     with service(configuration(TWO_AND_THREE, tmp_path, router), router) as running:
         story = driven(running, TWO_AND_THREE, TWO_AND_THREE.frames_of(None))
-        said = story.lines()
-        assert story.named == set(), said
-        assert story.corrections == [], said
-        assert story.last.move is None, said
+        message = story.lines()
+        assert story.named == set(), message
+        assert story.corrections == [], message
+        assert story.last.move is None, message
         edges = {edge.name: edge for edge in story.last.lidars}
         for name in ("roof to near_left", "roof to near_right"):
             assert edges[name].state == "measured", edges[name]
             assert edges[name].looks >= 3, edges[name]
         assert not any("inconsistent_rig" in codes for codes in reasons_of(running)), reasons_of(running)
-        looked_at = {sensor.name: sensor.state for sensor in story.last.sensors}
-        assert set(looked_at.values()) == {"calibrated"}, said
+        checked_at = {sensor.name: sensor.state for sensor in story.last.sensors}
+        assert set(checked_at.values()) == {"calibrated"}, message
         record_property("figure", f"{sum(story.last.looks.values())} looks, {len(edges)} edges between LiDARs")
         assert running.terminate() == 0
 
 
 @pytest.mark.slow
 @pytest.mark.fault("one of three LiDARs of a running vehicle is knocked by 1.5°", "it alone is named, in a minute")
-def test_of_three_lidars_the_one_that_was_knocked_is_named(
+def test_of_three_lidars_the_one_that_was_displaced_is_named(
     tmp_path: Path, router: Router, record_property: Callable[[str, object], None]
 ) -> None:
     with service(configuration(TWO_AND_THREE, tmp_path, router), router) as running:
         story = driven(running, TWO_AND_THREE, TWO_AND_THREE.frames_of(ROOF))
-        said = story.lines()
-        assert story.named == {LIDAR}, said
-        assert 0.0 < story.named_s(LIDAR) <= NAMED_S, said
-        by = next(told.move.by[LIDAR].by for told in (*story.told, story.last) if told.move is not None)
-        assert hypot(*by[:3]) == pytest.approx(ROOF.turn_deg, abs=MAX_ERROR_DEG), said
+        message = story.lines()
+        assert story.named == {LIDAR}, message
+        assert 0.0 < story.named_s(LIDAR) <= NAMED_S, message
+        by = next(reported.move.by[LIDAR].by for reported in (*story.reported, story.last) if reported.move is not None)
+        assert hypot(*by[:3]) == pytest.approx(ROOF.turn_deg, abs=MAX_ERROR_DEG), message
         record_property("figure", f"named {story.named_s(LIDAR):.0f} s of driving after the knock")
         assert running.terminate() == 0

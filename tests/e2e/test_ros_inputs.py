@@ -68,16 +68,16 @@ def reasons(running: Service) -> dict[str, str]:
     return {reason["code"]: reason["text"] for reason in running.health()["reasons"]}
 
 
-def test_ros_sees_who_listens_and_a_topic_that_nobody_publishes_is_told(
+def test_ros_sees_who_listens_and_a_topic_that_nobody_publishes_is_reported(
     stack: ExitStack, running: Service, router: Router
 ) -> None:
     driver(stack, router, "/rear/image_raw/compressed", "CompressedImage", 10, "rear_camera")
 
-    def told(health: Any) -> bool:
-        wanted = f"camera: no publisher of {TOPICS['camera']}; there are: /rear/image_raw/compressed"
-        return wanted in health["needs"]
+    def reported(health: Any) -> bool:
+        expected = f"camera: no publisher of {TOPICS['camera']}; there are: /rear/image_raw/compressed"
+        return expected in health["needs"]
 
-    running.until(running.health, told, "who is missing, and who is there")
+    running.until(running.health, reported, "who is missing, and who is there")
     replies = list(router.session.liveliness().get("@ros2_lv/0/*/0/*/*/%/%vehicle/coec/**", timeout=20.0))
     kinds = sorted(str(reply.ok.key_expr).split("/")[5] for reply in replies if reply.ok is not None)
     assert kinds == ["MS", "MS", "MS", "NN"]
@@ -91,7 +91,7 @@ def _has_received(pictures: int, pair: Any) -> bool:
 
 
 @pytest.mark.fault("two publishers on one topic of a running service", "health names their nodes until one ends")
-def test_two_drivers_on_one_topic_are_a_trouble_with_their_names(
+def test_two_drivers_on_one_topic_are_a_problem_with_their_names(
     stack: ExitStack, running: Service, router: Router, drive: Drive
 ) -> None:
     images, sent = pictures(drive), running.counters()["camera"]["received"]
@@ -103,8 +103,8 @@ def test_two_drivers_on_one_topic_are_a_trouble_with_their_names(
         left.put(next(images))
         right.put(next(images))
         sent += 2
-    told = running.until(lambda: reasons(running), lambda told: "two_senders" in told, "two senders")
-    assert told["two_senders"].startswith(
+    reported = running.until(lambda: reasons(running), lambda reported: "two_senders" in reported, "two senders")
+    assert reported["two_senders"].startswith(
         f"2 publishers send on {TOPICS['camera']} at the same time: /left_driver, /right_driver."
     )
     for _ in range(8):  # in portions that the inbox holds, each once the counters know of the one before
@@ -112,7 +112,7 @@ def test_two_drivers_on_one_topic_are_a_trouble_with_their_names(
             left.put(next(images))
             sent += 1
         running.until(running.counters, partial(_has_received, sent), "they are taken")
-    running.until(lambda: reasons(running), lambda told: "two_senders" not in told, "one sender")
+    running.until(lambda: reasons(running), lambda reported: "two_senders" not in reported, "one sender")
     assert "sequence_gap" not in losses(running)
 
 
@@ -139,8 +139,8 @@ def test_what_babbles_is_counted_by_its_cause(stack: ExitStack, running: Service
             for cause in ("wrong_type", "attachment_malformed", "sequence_gap")
         }
 
-    wanted = {"wrong_type": 1, "attachment_malformed": 2, "sequence_gap": 898}
-    running.until(lambda: losses(running), lambda told: new(told) == wanted, "every cause")
+    expected = {"wrong_type": 1, "attachment_malformed": 2, "sequence_gap": 898}
+    running.until(lambda: losses(running), lambda reported: new(reported) == expected, "every cause")
 
 
 @pytest.mark.fault(

@@ -53,8 +53,8 @@ def configured(folder: Path, drive: Drive, router: Router) -> Path:
         calibration=CalibrationConfig(depth=DepthConfig(model="stereo"), objective=ObjectiveConfig(kind="mi")),
         policy=PolicyConfig(apply="never"),
     )
-    told = {"stale_after_s": STALE_AFTER_S, "vehicle": "shuttle-7"}
-    path.write_text(commented_yaml(load_config(path).model_copy(update=told)))
+    reported = {"stale_after_s": STALE_AFTER_S, "vehicle": "shuttle-7"}
+    path.write_text(commented_yaml(load_config(path).model_copy(update=reported)))
     speaking_to_ros(path, "diagnostics", "tf_static", "camera_info", "overlay")
     return path
 
@@ -72,7 +72,7 @@ def tokens(session: zenoh.Session) -> list[str]:
     "the mount is off, the worker is killed, the camera falls silent, the service stops",
     "ROS's diagnostics go on at 1 Hz or more: ERROR, then STALE to the end",
 )
-def test_ros_is_told_of_everything_from_the_first_second_to_the_last(
+def test_ros_is_reported_of_everything_from_the_first_second_to_the_last(
     tmp_path: Path, drive: Drive, router: Router, record_property: Any
 ) -> None:
     overlay = f"/coec/{PAIR}/overlay/compressed"
@@ -119,19 +119,19 @@ def test_ros_is_told_of_everything_from_the_first_second_to_the_last(
     pictures = nodes.messages(overlay, "sensor_msgs/msg/CompressedImage")
     sent_s = {frame.stamp_ns / 1e9 + later_s for frame in drive.frames for later_s in (0, 60)}
     assert {stamp_s(picture.header) for picture in pictures} <= sent_s
-    drawn = cv2.imdecode(pictures[-1].data, cv2.IMREAD_COLOR)
-    assert drawn is not None
-    assert drawn.shape[1] == 960
+    samples = cv2.imdecode(pictures[-1].data, cv2.IMREAD_COLOR)
+    assert samples is not None
+    assert samples.shape[1] == 960
 
 
 def check_frame(message: Any, extrinsic: Any) -> None:
     """The calibrated camera as a child of the LiDAR: the inverse of what is served."""
-    (told,) = message.transforms
-    assert (told.header.frame_id, told.child_frame_id) == ("lidar", "camera_calibrated")
+    (reported,) = message.transforms
+    assert (reported.header.frame_id, reported.child_frame_id) == ("lidar", "camera_calibrated")
     pose = np.linalg.inv(np.array(extrinsic["camera_from_lidar"]["matrix"]))
-    moved = told.transform.translation
+    moved = reported.transform.translation
     assert np.allclose([moved.x, moved.y, moved.z], pose[:3, 3], atol=1e-12)
-    q = told.transform.rotation
+    q = reported.transform.rotation
     # The third row of a rotation matrix from its quaternion (Shoemake 1985).
     row = [2 * (q.x * q.z - q.y * q.w), 2 * (q.y * q.z + q.x * q.w), 1 - 2 * (q.x**2 + q.y**2)]
     assert np.allclose(row, pose[2, :3], atol=1e-12)

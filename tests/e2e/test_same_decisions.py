@@ -69,7 +69,7 @@ def drive() -> Drive:
     return rendered(STEPPED)
 
 
-def told_of(running: Service, *kinds: str) -> dict[str, Any]:
+def reported_of(running: Service, *kinds: str) -> dict[str, Any]:
     """What was decided and is served, and the entries of these kinds, without the wall clock and what hangs on it."""
     entries = [{**entry, "wall_ns": 0, "previous_sha256": "", "sequence": 0} for entry in running.entries(*kinds)]
     return {
@@ -89,7 +89,7 @@ def between(drive: Drive, begin_s: float, end_s: float) -> list[Frame]:
 @pytest.mark.fault("killed in the middle of a solve", "the decisions are those of an undisturbed replay")
 def test_killed_in_a_solve_and_replayed_the_decisions_are_the_same(tmp_path: Path, router: Router) -> None:
     small = rendered(SMALL)
-    ended_s = SLICES * SHORT_SLICE_S
+    finished_s = SLICES * SHORT_SLICE_S
 
     def configured(name: str) -> Path:
         window = WindowConfig(pairs=SHORT_PAIRS, min_pairs=4, slice_s=SHORT_SLICE_S)
@@ -98,25 +98,25 @@ def test_killed_in_a_solve_and_replayed_the_decisions_are_the_same(tmp_path: Pat
         )
 
     with service(configured("live"), router) as running:
-        running.send(between(small, 0, ended_s + OVER_S))
+        running.send(between(small, 0, finished_s + OVER_S))
         running.rest()
-        live = told_of(running, "estimate", "extrinsic")
+        live = reported_of(running, "estimate", "extrinsic")
         assert running.terminate() == 0
     assert [decision for *_, decision in live["windows"]] == ["accepted"] * SLICES
     assert len({str(entry["camera_from_lidar"]) for entry in live["entries"] if entry["kind"] == "extrinsic"}) > 1
 
     config = configured("killed")
     with service(config, router) as running:
-        running.send(between(small, 0, ended_s))
+        running.send(between(small, 0, finished_s))
         running.rest()
         psutil.Process(running.worker()["pid"]).suspend()
-        running.send(between(small, ended_s, ended_s + OVER_S))
+        running.send(between(small, finished_s, finished_s + OVER_S))
         running.until(running.counters, lambda pair: pair["windows"] == SLICES, "the last window is recorded")
         running.kill()
     with service(config, router, warm=False) as running:
-        running.until(running.history, lambda told: told["total"] == SLICES, "the window that was being solved")
+        running.until(running.history, lambda reported: reported["total"] == SLICES, "the window that was being solved")
         running.rest()
-        killed = told_of(running, "estimate", "extrinsic")
+        killed = reported_of(running, "estimate", "extrinsic")
         assert running.terminate() == 0
     assert killed == live
 
@@ -131,7 +131,7 @@ def test_killed_in_a_solve_and_replayed_the_decisions_are_the_same(tmp_path: Pat
 def decisions(running: Service) -> dict[str, Any]:
     """All of it, of a run that was not interrupted."""
     return {
-        **told_of(running, "estimate", "extrinsic", "state"),
+        **reported_of(running, "estimate", "extrinsic", "state"),
         "checks": running.history()["checks"],
         "losses": running.counters()["losses"],
     }
@@ -163,8 +163,8 @@ def test_live_restarted_and_replayed_the_decisions_are_the_same(
     write_bag(bag, recording.rig, recording.T_camera_lidar_start, whole, lambda _: None)
     config = stepped_configuration(tmp_path / "replayed", router, network)
     with service(config, router) as running:
-        told = ("--config", config, "--rate", REPLAY_SPEED, "--connect", router.endpoint)
-        played = coec("play", bag, *told, "--json")
+        reported = ("--config", config, "--rate", REPLAY_SPEED, "--connect", router.endpoint)
+        played = coec("play", bag, *reported, "--json")
         assert played.returncode == 0, played.stderr
         running.rest()
         running.end()
@@ -210,7 +210,7 @@ def decided_by(
         if until_silence:
             running.end()
         counters, decided = running.counters(), decisions(running)
-        told = {
+        reported = {
             **decided,
             "entries": [entry for entry in decided["entries"] if entry["kind"] != "state"],
             # Whether an answer is overdue is the clock's on the wall to say: a busy machine has more of these.
@@ -220,7 +220,7 @@ def decided_by(
             "lost": {name: counters[name]["losses"] for name in TOPICS},
         }
         assert running.terminate() == 0
-    return told
+    return reported
 
 
 @pytest.mark.slow
@@ -246,9 +246,9 @@ def test_native_frames_and_topics_of_rmw_zenoh_come_to_the_same(tmp_path: Path, 
     native, topics = (
         decided_by(configured(way), router, frames, way, until_silence=False) for way in ("native", "rmw_zenoh")
     )
-    for told in (native, topics):
+    for reported in (native, topics):
         # The one pair of the next slice, whose end in silence is not waited for.
-        told["losses"].pop("too_few_pairs", None)
+        reported["losses"].pop("too_few_pairs", None)
     assert len(native["files"]) == len(native["results"]) == 1
     assert topics == native
 
@@ -261,11 +261,11 @@ def test_native_frames_rmw_zenoh_and_a_bridge_come_to_the_same(
     frames = without_depth(drive.between(0, SECONDS + 1))
     # The last slice has pairs enough for a window: unless its end is waited for, whether it has ended when the question
     # comes is a matter of the clock on the wall.
-    ways = {
+    directions = {
         way: decided_by(stepped_configuration(tmp_path / way, router, network), router, frames, way, until_silence=True)
         for way in ("native", "rmw_zenoh", "ros2dds")
     }
-    assert set(ways["native"]["states"]) >= {"healthy", "suspect", "miscalibrated"}
-    assert len(ways["native"]["files"]) > 2
-    assert ways["rmw_zenoh"] == ways["native"]
-    assert ways["ros2dds"] == ways["native"]
+    assert set(directions["native"]["states"]) >= {"healthy", "suspect", "miscalibrated"}
+    assert len(directions["native"]["files"]) > 2
+    assert directions["rmw_zenoh"] == directions["native"]
+    assert directions["ros2dds"] == directions["native"]

@@ -22,7 +22,7 @@ from support.recordings import converted
 pytest.importorskip("embreex", reason="needs the optional extra `sim`")
 
 SLICE_S, SLICES = 12, 2
-ENDED_S = SLICES * SLICE_S
+FINISHED_S = SLICES * SLICE_S
 CERTAIN_S = 2
 """Of driving, until the pair that ends a window is certain."""
 
@@ -60,30 +60,30 @@ def configured(folder: Path, drive: Drive, router: Router, middleware: str) -> P
 )
 def test_the_same_drive_is_decided_alike_however_it_comes(tmp_path: Path, router: Router) -> None:
     drive = rendered(STEPPED)
-    frames = without_depth(drive.between(0, ENDED_S + CERTAIN_S))
+    frames = without_depth(drive.between(0, FINISHED_S + CERTAIN_S))
     with service(configured(tmp_path / "live", drive, router, "native"), router) as running:
         running.send(frames)
         running.rest()
         running.end()
         live = decisions(running)
         assert running.terminate() == 0
-    assert len(live["windows"]) == ENDED_S // SLICE_S
+    assert len(live["windows"]) == FINISHED_S // SLICE_S
 
     bag = tmp_path / "drive.mcap"
     write_bag(bag, drive.recording.rig, drive.recording.T_camera_lidar_start, frames, lambda _: None)
     database = converted(bag, tmp_path / "folder", StoragePlugin.SQLITE3)
-    ways: list[tuple[str, Path, tuple[Any, ...]]] = [
+    directions: list[tuple[str, Path, tuple[Any, ...]]] = [
         ("native", bag, ()),
         ("native", database, ("--encoding", "cdr")),
         ("rmw_zenoh", bag, ()),
         ("rmw_zenoh", database, ()),
         ("ros2dds", bag, ()),
     ]
-    for number, (middleware, source, options) in enumerate(ways):
+    for number, (middleware, source, options) in enumerate(directions):
         config = configured(tmp_path / str(number), drive, router, middleware)
         with service(config, router) as running:
-            told = ("--config", config, "--rate", SPEED, "--connect", router.endpoint, "--json")
-            played = coec("play", source, *told, *options)
+            reported = ("--config", config, "--rate", SPEED, "--connect", router.endpoint, "--json")
+            played = coec("play", source, *reported, *options)
             assert played.returncode == 0, played.stderr
             running.sent = Counter(camera=len([f for f in frames if type(f).__name__ == "CameraFrame"]))
             running.rest()

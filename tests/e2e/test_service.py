@@ -58,7 +58,7 @@ def _text(document: Any) -> str:
     return json.dumps(document["camera_from_lidar"], sort_keys=True)
 
 
-def _asked(endpoint: str, *arguments: object) -> Any:
+def _requested(endpoint: str, *arguments: object) -> Any:
     """The document of `coec query ARGS --json`."""
     done = coec_here("query", *arguments, "--connect", endpoint, "--json")
     assert done.returncode == 0, f"{arguments}: {done.stdout}{done.stderr}"
@@ -76,10 +76,10 @@ def _solved(running: Service, endpoint: str, count: int) -> Any:
     """Has the window of so many pictures finished, unless silence did, and solved; the extrinsic that is served
     then."""
     running.until(running.counters, lambda pair: pair["camera"]["received"] == count, "every picture")
-    acknowledged = _asked(endpoint, "command/calibrate")
+    acknowledged = _requested(endpoint, "command/calibrate")
     assert acknowledged["accepted"], acknowledged
-    running.until(running.extrinsic, lambda told: told["status"] != "not_accepted", "the result")
-    return _asked(endpoint, "extrinsic")
+    running.until(running.extrinsic, lambda reported: reported["status"] != "not_accepted", "the result")
+    return _requested(endpoint, "extrinsic")
 
 
 def _check_corrected(extrinsic: Any, perturbation: Any) -> None:
@@ -91,7 +91,7 @@ def _check_corrected(extrinsic: Any, perturbation: Any) -> None:
 def _check_same_by_calibrate(endpoint: str, extrinsic: Any, folder: Path) -> Path:
     """Downloads the window, calibrates it, replays it: the same to the byte."""
     window = folder / "downloaded.mcap"
-    _asked(endpoint, f"windows/{extrinsic['window_id']}", "--output", window)
+    _requested(endpoint, f"windows/{extrinsic['window_id']}", "--output", window)
     calibrated = coec_here("calibrate", window, "--json")
     assert calibrated.returncode == 0, calibrated.stderr
     assert _text(json.loads(calibrated.stdout)) == _text(extrinsic)
@@ -101,7 +101,7 @@ def _check_same_by_calibrate(endpoint: str, extrinsic: Any, folder: Path) -> Pat
 
 def _check_exported(endpoint: str, state: Path, config: Path) -> None:
     """The file that the service answers is the one that its state directory exports to."""
-    answered = _asked(endpoint, "extrinsic", "--param", "format=kalibr")
+    answered = _requested(endpoint, "extrinsic", "--param", "format=kalibr")
     exported = coec_here("export", state, "--config", config, "--format", "kalibr")
     assert exported.returncode == 0, exported.stderr
     assert exported.stdout == answered
@@ -119,7 +119,7 @@ def test_from_frames_to_extrinsic_and_after_a_restart(tmp_path: Path, drive: Dri
     source = drive.recording
     config = write_configuration(tmp_path, source, router.endpoint, PERTURBATION, calibration=BY_DEPTH, window=WINDOW)
     with service(config, router) as running:
-        before = _asked(router.endpoint, "extrinsic")
+        before = _requested(router.endpoint, "extrinsic")
         assert (before["provenance"], before["status"]) == ("nominal", "not_accepted")
         refused = coec_here("query", "extrinsic", "--param", "format=urdf", "--connect", router.endpoint)
         assert (refused.returncode, "nothing has been accepted yet" in refused.stderr) == (1, True)
@@ -127,10 +127,10 @@ def test_from_frames_to_extrinsic_and_after_a_restart(tmp_path: Path, drive: Dri
         extrinsic = _solved(running, router.endpoint, SHORT_PAIRS)
         assert (extrinsic["provenance"], extrinsic["status"]) == ("estimated", "accepted")
         _check_corrected(extrinsic, PERTURBATION)
-        assert _asked(router.endpoint, "health")["state"] == "healthy"
+        assert _requested(router.endpoint, "health")["state"] == "healthy"
         _check_exported(router.endpoint, tmp_path / "state", config)
         window = _check_same_by_calibrate(router.endpoint, extrinsic, tmp_path)
-        (listed,) = _asked(router.endpoint, "windows")["windows"]
+        (listed,) = _requested(router.endpoint, "windows")["windows"]
         assert listed["decision"] == "accepted"
         _check_opens_in_ros_tools(window, "/coec/sim/lidar/points", listed["pairs"])
         assert running.terminate() == 0
@@ -166,11 +166,11 @@ def _bring_into_a_solve(running: Service, frames: list[Frame]) -> int:
     a while: a solve with `SLOW` takes much longer.
     """
     # A new worker prepares kernels while nothing waits; held in that, it would not take the job.
-    idle = running.until(running.worker, lambda told: told["state"] == "idle", "the worker has nothing to do")
+    idle = running.until(running.worker, lambda reported: reported["state"] == "idle", "the worker has nothing to do")
     worker = psutil.Process(idle["pid"])
     worker.suspend()
     running.send(frames)
-    running.until(running.worker, lambda told: told["state"] == "busy", "the worker has the window")
+    running.until(running.worker, lambda reported: reported["state"] == "busy", "the worker has the window")
     before_s = worker.cpu_times().user
     worker.resume()
     wait_until(lambda: worker.cpu_times().user > before_s + COMPUTED_S, "the worker computes")
@@ -186,9 +186,9 @@ def test_worker_killed_and_service_stopped_in_a_solve_lose_no_window(
     )
     windows = tmp_path / "state" / "windows"
     frames = [*drive.frames, *later(drive.frames, SHORT_S), *later(drive.frames, 2 * SHORT_S)]
-    begun_ns = drive.start_ns + round((SHORT_S + OVER_S) * NS_PER_S)
+    started_ns = drive.start_ns + round((SHORT_S + OVER_S) * NS_PER_S)
     with service(config, router) as running:
-        victim = _bring_into_a_solve(running, [frame for frame in frames if frame.stamp_ns < begun_ns])
+        victim = _bring_into_a_solve(running, [frame for frame in frames if frame.stamp_ns < started_ns])
         os.kill(victim, signal.SIGKILL)
         assert running.extrinsic()["status"] == "not_accepted"
         assert running.health()["state"] in ("unknown", "degraded")
@@ -197,15 +197,17 @@ def test_worker_killed_and_service_stopped_in_a_solve_lose_no_window(
             return worker["restarts"] == 1 and worker["pid"] not in (None, victim)
 
         running.until(running.worker, replaced, "another worker is there")
-        told = running.until(running.history, lambda told: bool(told["results"]), "the window is solved after all")
-        (result,) = told["results"]
+        reported = running.until(
+            running.history, lambda reported: bool(reported["results"]), "the window is solved after all"
+        )
+        (result,) = reported["results"]
         recorded = read_result(windows / f"{result['window_id']}.mcap")
         assert recorded is not None
         assert recorded.model_dump(mode="json") == result
         assert result["pairs"] == SHORT_PAIRS
 
         # The rest ends a second window, and leaves a third one open.
-        _bring_into_a_solve(running, [frame for frame in frames if frame.stamp_ns >= begun_ns])
+        _bring_into_a_solve(running, [frame for frame in frames if frame.stamp_ns >= started_ns])
         assert running.terminate() == 0
     files = sorted(windows.iterdir())
     assert [(path.suffix, read_result(path) is None) for path in files] == [(".mcap", n > 0) for n in range(3)]
@@ -215,9 +217,11 @@ def test_worker_killed_and_service_stopped_in_a_solve_lose_no_window(
     assert all(WINDOW.min_pairs <= pairs <= SHORT_PAIRS for pairs in others)
 
     with service(config, router, warm=False) as running:
-        told = running.until(running.history, lambda told: told["total"] == 3, "what the last run left is solved")
-        assert told["results"][0] == result
-        assert {one["window_id"] for one in told["results"]} == {path.stem for path in files}
+        reported = running.until(
+            running.history, lambda reported: reported["total"] == 3, "what the last run left is solved"
+        )
+        assert reported["results"][0] == result
+        assert {one["window_id"] for one in reported["results"]} == {path.stem for path in files}
         assert running.terminate() == 0
 
 
@@ -227,14 +231,14 @@ def test_playing_to_nobody_says_so(
     monkeypatch.setattr(play, "LISTENER_S", 0.1)
     source = drive.source.replace(f"seconds={SHORT_S}", "seconds=1")
     assert play.play(source, connect=router.endpoint, rate=0.0, as_json=True) == 0
-    said = capsys.readouterr()
-    assert json.loads(said.out)["nobody_listened_to"] == [
+    stated = capsys.readouterr()
+    assert json.loads(stated.out)["nobody_listened_to"] == [
         f"sensors/sim/{stream}" for stream in ("camera", "lidar", "ego")
     ]
-    assert "nobody listens" in said.err
+    assert "nobody listens" in stated.err
 
 
-def test_questions_to_nobody_fail() -> None:
+def test_queries_to_nobody_fail() -> None:
     done = coec("query", "health", "--connect", "tcp/127.0.0.1:9", "--timeout", "0.5", "--json")
     assert done.returncode == 1
     assert json.loads(done.stdout)["error"]["code"] == "not_connected"

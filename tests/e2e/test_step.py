@@ -28,7 +28,7 @@ from e2e.drives import (
     rendered,
     stepped_configuration,
 )
-from e2e.planted import plant, said, written
+from e2e.planted import plant, reported, written
 from e2e.processes import PATIENCE_S, Router, Service, service
 from support.readers import read_recording
 from support.router import TestAuthority
@@ -57,15 +57,15 @@ def drive() -> Drive:
     return rendered(STEPPED)
 
 
-def asked(running: Service, selector: str) -> Reply:
+def requested(running: Service, selector: str) -> Reply:
     return query_one(running.session, selector, PATIENCE_S)
 
 
 def commanded(running: Service, name: str, credentials: Credentials) -> str:
     """What a proven command comes to."""
     speaker, selector = CommandSender(credentials, running.config.vehicle), running.keys.command(running.pair, name)
-    told = send_authenticated(running.session, f"{selector}?format=json", None, PATIENCE_S, speaker, JSON)
-    return str(json.loads(told.payload)["code"])
+    reply = send_authenticated(running.session, f"{selector}?format=json", None, PATIENCE_S, speaker, JSON)
+    return str(json.loads(reply.payload)["code"])
 
 
 @pytest.mark.fault(
@@ -98,9 +98,9 @@ def test_a_step_is_noticed_corrected_and_remembered(
         running.rest()
         step_ns = drive.start_ns + EARLY_STEP_S * NS_PER_S
         # On a busy machine a pair may also be degraded while answers are awaited: by the clock, not by sensor time.
-        told = [entry for entry in running.entries("state") if entry["stamp_ns"] is not None]
-        assert told[0]["code"] == "healthy", "no false alarm"
-        states = {entry["code"]: (entry["stamp_ns"] - step_ns) / NS_PER_S for entry in told}
+        changes = [entry for entry in running.entries("state") if entry["stamp_ns"] is not None]
+        assert changes[0]["code"] == "healthy", "no false alarm"
+        states = {entry["code"]: (entry["stamp_ns"] - step_ns) / NS_PER_S for entry in changes}
         figures = [f"{state} after {at_s:.0f} s" for state, at_s in states.items() if at_s > 0]
         record_property("figure", ", ".join(figures))
         # Where frames were held up, checks at odds with each other may call for the window that tells: degraded, then.
@@ -112,17 +112,17 @@ def test_a_step_is_noticed_corrected_and_remembered(
         assert running.health()["state"] in ("healthy", "unknown")
         assert drive.error_deg(running.extrinsic(), EARLY_SECONDS) < MAX_ERROR_DEG
 
-        (event,) = running.ask(keys.evidence(pair))["events"]
+        (event,) = running.query(keys.evidence(pair))["events"]
         assert event["resolution"].startswith("healthy")
         assert {event["window_before"], event["window_after"]} <= {item["window_id"] for item in running.windows()}
         assert event["overlays"] == ["before", "after"]
-        kept = keys.evidence_of(pair, event["event_id"])
-        assert len(running.ask(kept)["metrics"]) > 5
-        assert asked(running, f"{kept}?overlay=after").payload[:3] == b"\xff\xd8\xff"
+        retained = keys.evidence_of(pair, event["event_id"])
+        assert len(running.query(retained)["metrics"]) > 5
+        assert requested(running, f"{retained}?overlay=after").payload[:3] == b"\xff\xd8\xff"
         for parameters in ("", "?at=nominal", f"?window={event['window_before']}"):
-            drawn = asked(running, f"{keys.overlay(pair)}{parameters}")
-            assert drawn.encoding == "image/jpeg"
-            assert drawn.payload[:3] == b"\xff\xd8\xff"
+            samples = requested(running, f"{keys.overlay(pair)}{parameters}")
+            assert samples.encoding == "image/jpeg"
+            assert samples.payload[:3] == b"\xff\xd8\xff"
 
         back = running.command("rollback", json.dumps({"to": before["window_id"]}).encode())
         assert back["code"] == "rolled_back"
@@ -130,7 +130,7 @@ def test_a_step_is_noticed_corrected_and_remembered(
         assert running.health()["state"] == "unknown"
         assert running.command("hold")["code"] == "held"
         assert running.command("reset")["code"] == "held"
-        replies = list(said(running))
+        replies = list(reported(running))
         assert len(replies) > 30
         assert not any(b"uplink_busy" in reply for reply in replies)
         programs = (running.process.pid, running.worker()["pid"])
@@ -153,8 +153,8 @@ def test_a_step_is_noticed_corrected_and_remembered(
         assert running.extrinsic()["provenance"] == "nominal"
         assert running.terminate() == 0
         disk = [*written(tmp_path / "state"), running.log.read_bytes()]
-    found = [(secret, text[:200]) for secret in secrets for text in (*replies, *lines, *disk) if secret in text]
-    assert found == []
+    result = [(secret, text[:200]) for secret in secrets for text in (*replies, *lines, *disk) if secret in text]
+    assert result == []
     record_property("figure", f"{len(secrets)} secrets, {len(replies)} replies, {len(disk)} texts on the disk")
 
 
@@ -184,10 +184,10 @@ def test_with_never_the_candidate_waits_and_nothing_else_changes(tmp_path: Path,
         assert after["pending"] is not None
         assert drive.error_deg(after["pending"], SECONDS) < MAX_ERROR_DEG
 
-        events = running.ask(running.keys.evidence(running.pair))["events"]
+        events = running.query(running.keys.evidence(running.pair))["events"]
         evidence = {window for event in events for window in (event["window_before"], event["window_after"])}
-        kept = {window["window_id"] for window in running.windows() if window["kept_for"] == "red_event"}
-        assert kept == evidence - {None}
+        retained = {window["window_id"] for window in running.windows() if window["kept_for"] == "red_event"}
+        assert retained == evidence - {None}
         snippet, *_ = running.until(running.snippets, bool, "the seconds around the step")
         fetched = tmp_path / f"{snippet['snippet_id']}.mcap"
         names = (running.pair, snippet["snippet_id"])

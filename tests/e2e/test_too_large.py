@@ -74,7 +74,7 @@ def test_what_zenoh_drops_is_counted_as_far_as_it_can_be_known(
             publishers[name] = session.declare_publisher(f"in/{name}", congestion_control=block)
         wait_until(lambda: all(map(has_subscribers, publishers.values())), "the service", PATIENCE_S)
 
-        def told() -> dict[str, StreamStatus]:
+        def reported() -> dict[str, StreamStatus]:
             status = vehicle.bench.answers.status()
             return {"camera": status.camera, "lidar": status.lidar}
 
@@ -91,8 +91,8 @@ def test_what_zenoh_drops_is_counted_as_far_as_it_can_be_known(
             expected = {name: number + 1 - (name == stream and number >= DROPPED) for name in frames}
 
             def taken(expected: dict[str, int] = expected) -> bool:
-                return {name: one.received for name, one in told().items()} == expected
+                return {name: one.received for name, one in reported().items()} == expected
 
             wait_until(taken, f"pair {number}", PATIENCE_S)
-        wait_until(lambda: {name: one.losses for name, one in told().items()} == counted, f"{counted}", PATIENCE_S)
+        wait_until(lambda: {name: one.losses for name, one in reported().items()} == counted, f"{counted}", PATIENCE_S)
     record_property("figure", ", ".join(f"{name} {causes}" for name, causes in counted.items() if causes))

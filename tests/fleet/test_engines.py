@@ -62,12 +62,12 @@ def decided(engine: Engine, jobs: list[Job]) -> dict[str, str | None]:
 
 
 def expected(recorded: Path) -> dict[str, str | None]:
-    told: dict[str, str | None] = {}
+    reported: dict[str, str | None] = {}
     for path in sorted(recorded.rglob("*.mcap")):
         result = read_result(path)
         assert result is not None
-        told[str(path)] = hashlib.sha256(to_json(result)).hexdigest()
-    return told
+        reported[str(path)] = hashlib.sha256(to_json(result)).hexdigest()
+    return reported
 
 
 @pytest.mark.fault("a window ends the process that judges it", "a row with its error; the others are judged")
@@ -76,8 +76,8 @@ def test_a_poisoned_window_is_a_row_and_the_others_are_decided_as_by_the_vehicle
 ) -> None:
     want = expected(recorded)
     one, two = want
-    told = decided(LocalEngine(2, BOUNDS), [Job(one), Job(poisoned), Job(two)])
-    assert told == {**want, poisoned: PROCESS_DIED}
+    reported = decided(LocalEngine(2, BOUNDS), [Job(one), Job(poisoned), Job(two)])
+    assert reported == {**want, poisoned: PROCESS_DIED}
 
 
 @pytest.mark.fault("a window that never ends, or takes all memory", "a row with its error, within the bounds")

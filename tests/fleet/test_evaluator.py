@@ -42,16 +42,16 @@ def test_a_window_says_whose_it_is_without_a_result(window: Path) -> None:
 
 def test_another_configuration_decides_for_the_pair_that_it_names_or_for_all_if_it_names_one(window: Path) -> None:
     other = WINDOW_CONFIGURATION.model_copy(update={"motion_compensation": False})
-    desk = WindowEvaluator(ReplaySettings(calibrations={"elsewhere": other}, any_pair=other))
-    row = desk.row(Job(str(window)))
+    bench = WindowEvaluator(ReplaySettings(calibrations={"elsewhere": other}, any_pair=other))
+    row = bench.row(Job(str(window)))
     assert row.result is not None
     assert row.decided != row.recorded
     assert row.result.compensation["disabled"] == row.result.pairs
 
 
 def test_a_configuration_that_does_not_know_the_pair_is_an_error_of_the_window(window: Path) -> None:
-    desk = WindowEvaluator(ReplaySettings(calibrations={"left": CalibrationConfig(), "right": CalibrationConfig()}))
-    row = desk.row(Job(str(window)))
+    bench = WindowEvaluator(ReplaySettings(calibrations={"left": CalibrationConfig(), "right": CalibrationConfig()}))
+    row = bench.row(Job(str(window)))
     assert row.error_code == ConfigError.reply_code
     assert "left, right" in str(row.error)
 
@@ -91,9 +91,9 @@ def test_what_cannot_be_judged_is_a_row(window: Path, tmp_path: Path) -> None:
     cut, flipped = tmp_path / "cut.mcap", tmp_path / "flipped.mcap"
     cut.write_bytes(whole[: len(whole) // 2])
     flipped.write_bytes(whole[:4000] + bytes([whole[4000] ^ 1]) + whole[4001:])
-    desk = WindowEvaluator(ReplaySettings())
+    bench = WindowEvaluator(ReplaySettings())
     codes = {
-        job.url: desk.row(job).error_code
+        job.url: bench.row(job).error_code
         for job in (
             Job(str(window), sha256="0" * 64),
             Job(str(cut)),
@@ -105,7 +105,7 @@ def test_what_cannot_be_judged_is_a_row(window: Path, tmp_path: Path) -> None:
     }
     assert list(codes.values()) == ["bad_source", "bad_window", "bad_window", "bad_source", "bad_source", "bad_request"]
     # Nothing of it stays with the desk.
-    assert desk.row(Job(str(window), sha256=hashlib.sha256(whole).hexdigest())).error is None
+    assert bench.row(Job(str(window), sha256=hashlib.sha256(whole).hexdigest())).error is None
 
 
 def test_a_fault_of_ours_is_a_row_as_well(window: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ import pytest
 from coec.fleet.jobs import Job
 from coec.fleet.worker_pool import WINDOWS_PER_WORKER, WindowQueue
 
-TROUBLE = ("process_died", "it ended")
+PROBLEM = ("process_died", "it ended")
 
 
 def jobs(count: int) -> list[Job]:
@@ -29,12 +29,12 @@ def test_after_an_end_each_window_is_tried_by_itself_and_the_second_end_is_its_o
     one, two, three = jobs(3)
     queue = WindowQueue([one, two, three])
     assert [queue.next_for([]), queue.next_for([one])] == [one, two]
-    assert list(queue.retry_alone([one, two], *TROUBLE)) == []
+    assert list(queue.retry_alone([one, two], *PROBLEM)) == []
     assert queue.next_for([three]) is None  # a process that has others gets no suspected one
     assert queue.next_for([]) == one
     assert queue.next_for([one]) is None  # nor does one that has it get others
-    (row,) = queue.retry_alone([one], *TROUBLE)
-    assert (row.url, row.error_code, row.error) == (one.url, *TROUBLE)
+    (row,) = queue.retry_alone([one], *PROBLEM)
+    assert (row.url, row.error_code, row.error) == (one.url, *PROBLEM)
     assert [queue.next_for([]), queue.next_for([])] == [two, three]
 
 
@@ -55,7 +55,7 @@ def test_whoever_is_poisoned_nobody_else_is_lost(seed: int) -> None:
         has = rng.choice([has for has in seats if has])
         job = rng.choice(has)
         if job in poisoned:
-            lost += [row.url for row in queue.retry_alone(has, *TROUBLE)]
+            lost += [row.url for row in queue.retry_alone(has, *PROBLEM)]
             has.clear()
         else:
             has.remove(job)

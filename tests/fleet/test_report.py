@@ -46,38 +46,38 @@ def results(rows: list[WindowRow], tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 @pytest.fixture(scope="module")
-def told(results: Path) -> FleetReport:
+def reported(results: Path) -> FleetReport:
     return report(results, None)
 
 
-def test_vehicles_that_drift_come_first_with_their_axis(told: FleetReport) -> None:
-    by_urgency = [(pair.vehicle, pair.worst) for pair in told.pairs[:2]]
+def test_vehicles_that_drift_come_first_with_their_axis(reported: FleetReport) -> None:
+    by_urgency = [(pair.vehicle, pair.worst) for pair in reported.pairs[:2]]
     assert by_urgency == [("v003", "ry_deg"), ("v007", "tx_m")]
-    yaw = told.pairs[0]
+    yaw = reported.pairs[0]
     assert yaw.drift[1] == pytest.approx(1.2, rel=0.15)
     assert yaw.urgency == pytest.approx(abs(yaw.drift[1] or 0.0) / 0.5)
     days = WINDOWS * 2.4 / 24.0
     assert yaw.slope[1] == pytest.approx(1.2 / days * 30.0, rel=0.15)
-    for pair in told.pairs[2:]:
+    for pair in reported.pairs[2:]:
         assert pair.urgency < 0.5
 
 
-def test_counts_are_those_of_the_rows(told: FleetReport, rows: list[WindowRow]) -> None:
+def test_counts_are_those_of_the_rows(reported: FleetReport, rows: list[WindowRow]) -> None:
     results = [row.result for row in rows if row.result is not None]
     accepted = [result for result in results if result.verdict.decision == "accepted"]
-    assert (told.windows, told.accepted) == (len(rows), len(accepted))
-    assert told.refusals == {"sigma_deg": len(results) - len(accepted)}
-    assert told.errors == {"bad_window": len(rows) - len(results)}
+    assert (reported.windows, reported.accepted) == (len(rows), len(accepted))
+    assert reported.refusals == {"sigma_deg": len(results) - len(accepted)}
+    assert reported.errors == {"bad_window": len(rows) - len(results)}
     assert len(results) < len(rows) * (1.0 - FAILED_SHARE / 4.0)
     assert len(results) - len(accepted) > len(rows) * REFUSED_SHARE / 4.0
     # Windows that could not be read have no vehicle; they are no vehicle's drift either.
-    assert {pair.vehicle for pair in told.pairs} == {*(f"v{index:03}" for index in range(VEHICLES)), "unknown"}
+    assert {pair.vehicle for pair in reported.pairs} == {*(f"v{index:03}" for index in range(VEHICLES)), "unknown"}
     (first_ns, last_ns) = min(r.data_stamp_ns for r in results), max(r.data_stamp_ns for r in results)
-    assert (told.first_ns, told.last_ns) == (first_ns, last_ns)
+    assert (reported.first_ns, reported.last_ns) == (first_ns, last_ns)
 
 
-def test_days_are_medians_and_bands_as_numpy_has_them(told: FleetReport, rows: list[WindowRow]) -> None:
-    pair = next(pair for pair in told.pairs if pair.vehicle == "v005")
+def test_days_are_medians_and_bands_as_numpy_has_them(reported: FleetReport, rows: list[WindowRow]) -> None:
+    pair = next(pair for pair in reported.pairs if pair.vehicle == "v005")
     by_day: dict[str, list[float]] = {}
     for row in rows:
         result = row.result
@@ -91,7 +91,7 @@ def test_days_are_medians_and_bands_as_numpy_has_them(told: FleetReport, rows: l
     assert len(pair.days) > 3
 
 
-def test_an_axis_that_no_window_tells_has_no_drift(rows: list[WindowRow], tmp_path: Path) -> None:
+def test_an_axis_that_no_window_determines_has_no_drift(rows: list[WindowRow], tmp_path: Path) -> None:
     blind = [
         row.model_copy(update={"result": row.result.model_copy(update={"unobservable": (False,) * 5 + (True,)})})
         for row in rows[:WINDOWS]
@@ -144,7 +144,7 @@ def test_every_example_of_a_query_answers(results: Path) -> None:
     assert dict(tables.columns(results))["correlation"] == "DOUBLE[]"
 
 
-def test_the_view_that_is_printed_is_the_one_that_is_asked(rows: list[WindowRow], tmp_path: Path) -> None:
+def test_the_view_that_is_printed_is_the_one_that_is_requested(rows: list[WindowRow], tmp_path: Path) -> None:
     """A vehicle whose name is a number keeps its zeros."""
     tables.write_tables(tmp_path, [row.model_copy(update={"vehicle": "007"}) for row in rows[:2]], "part-1")
     connection = duckdb.connect()
@@ -162,19 +162,19 @@ def test_false_alarms_of_vehicles_stand_on_the_page(results: Path) -> None:
     assert "&lt;v&gt;/front" in text
 
 
-def test_a_drift_that_one_window_cannot_tell_is_not_denied(rows: list[WindowRow], tmp_path: Path) -> None:
+def test_a_drift_that_one_window_cannot_decide_is_not_denied(rows: list[WindowRow], tmp_path: Path) -> None:
     tables.write_tables(
         tmp_path, [next(row for row in rows if row.result and row.result.verdict.decision == "accepted")], "part-1"
     )
-    told = report(tmp_path, None)
-    (verdict,) = fleet_page.page(told, "fleet", MADE).opening
+    reported = report(tmp_path, None)
+    (verdict,) = fleet_page.page(reported, "fleet", MADE).opening
     assert isinstance(verdict, VerdictBanner)
     assert (verdict.tone, verdict.word) == ("none", "Drift not known.")
-    assert fleet_page.sentence(told).startswith("1 vehicle, 1 window on 20")
-    assert fleet_page.sentence(told).endswith("too few accepted windows to tell a drift: 1.")
+    assert fleet_page.sentence(reported).startswith("1 vehicle, 1 window on 20")
+    assert fleet_page.sentence(reported).endswith("too few accepted windows to tell a drift: 1.")
 
 
-def test_a_folder_without_tables_is_told(tmp_path: Path) -> None:
+def test_a_folder_without_tables_is_reported(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="coec batch"):
         report(tmp_path, None)
 
@@ -202,13 +202,13 @@ class Page(HTMLParser):
 
 
 @pytest.mark.fault("a vehicle that calls itself markup", "text in the page of the fleet")
-def test_the_page_loads_nothing_and_names_are_text_in_it(told: FleetReport) -> None:
+def test_the_page_loads_nothing_and_names_are_text_in_it(reported: FleetReport) -> None:
     name = "<script src=x onerror=alert(1)>'\"&"
-    pairs = (told.pairs[0].model_copy(update={"vehicle": name, "pair": name}), *told.pairs[1:])
-    text = render(fleet_page.page(told.model_copy(update={"pairs": pairs}), name, MADE))
+    pairs = (reported.pairs[0].model_copy(update={"vehicle": name, "pair": name}), *reported.pairs[1:])
+    text = render(fleet_page.page(reported.model_copy(update={"pairs": pairs}), name, MADE))
     page = Page(text)
     assert [load for load in page.loads if load != "a href"] == []
     assert page.open == []
     assert text.count("<script") == 1, "that of the page itself"
-    assert text.count("<svg") == sum(pair.worst is not None for pair in told.pairs)
-    assert "2 of" in fleet_page.sentence(told)
+    assert text.count("<svg") == sum(pair.worst is not None for pair in reported.pairs)
+    assert "2 of" in fleet_page.sentence(reported)

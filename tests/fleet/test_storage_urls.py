@@ -62,12 +62,12 @@ def test_each_window_once_and_in_order(folder: Path) -> None:
     assert names(jobs, str(folder)) == ALL
 
 
-def test_what_names_no_window_is_told(folder: Path) -> None:
+def test_what_names_no_window_is_reported(folder: Path) -> None:
     with pytest.raises(UsageError, match="names no window"):
         jobs_of([f"{folder}/none/*.mcap"])
 
 
-def test_hashes_beside_windows_are_their_statement(folder: Path, store: str) -> None:
+def test_hashes_next_to_windows_are_their_statement(folder: Path, store: str) -> None:
     sums = f"{SHA256}  1.mcap\n{SHA256.upper()} *./other.mcap\nrubbish\n"
     (folder / "a" / "SHA256SUMS").write_text(sums)
     stated = {Path(job.url).name: job.sha256 for job in jobs_of([str(folder)])}
@@ -77,9 +77,9 @@ def test_hashes_beside_windows_are_their_statement(folder: Path, store: str) -> 
     assert stated == {"1.mcap": SHA256, "2.mcap": None, "3.mcap": None}
 
 
-def test_a_store_that_nobody_knows_or_that_fails_is_told_without_a_password() -> None:
+def test_a_store_that_nobody_knows_or_that_fails_is_reported_without_a_password() -> None:
     with pytest.raises(UsageError, match="nowhere"):
         jobs_of(["nowhere://host/*.mcap"])
-    with pytest.raises(SourceError, match=r"ftp://127\.0\.0\.1/") as told:
+    with pytest.raises(SourceError, match=r"ftp://127\.0\.0\.1/") as reported:
         jobs_of(["ftp://somebody:secret@127.0.0.1:1/*.mcap"])
-    assert "secret" not in str(told.value)
+    assert "secret" not in str(reported.value)

@@ -34,7 +34,7 @@ def rows(count: int) -> Iterator[WindowRow]:
     return (empty_row(Job(f"{index}.mcap"), {}) for index in range(count))
 
 
-def asked(folder: Path, query: str) -> list[tuple[Any, ...]]:
+def requested(folder: Path, query: str) -> list[tuple[Any, ...]]:
     table = f"read_parquet('{folder}/**/*.parquet', hive_partitioning = true)"
     rows: list[tuple[Any, ...]] = duckdb.sql(query.replace("TABLE", table)).fetchall()
     return rows
@@ -44,7 +44,7 @@ def test_a_row_holds_everything_that_was_decided(tmp_path: Path, row: WindowRow)
     tables.write_tables(tmp_path, [row, lost_row(Job("gone.mcap"), "process_died", "it ended")], "part-1")
     result = row.result
     assert result is not None
-    ((url, vehicle, date, accepted, rx, sigma, figures, pitch_height, text),) = asked(
+    ((url, vehicle, date, accepted, rx, sigma, figures, pitch_height, text),) = requested(
         tmp_path,
         "SELECT url, vehicle, date, accepted, rx_deg, sigma_rx_deg, figures, correlation[5], result FROM TABLE"
         " WHERE error IS NULL",
@@ -55,7 +55,7 @@ def test_a_row_holds_everything_that_was_decided(tmp_path: Path, row: WindowRow)
     assert figures == {name: metric.value for name, metric in result.metrics.items()}
     assert pitch_height == result.correlation_pitch_height
     assert type(result).model_validate_json(text) == result
-    ((vehicle, code),) = asked(tmp_path, "SELECT vehicle, error_code FROM TABLE WHERE error IS NOT NULL")
+    ((vehicle, code),) = requested(tmp_path, "SELECT vehicle, error_code FROM TABLE WHERE error IS NOT NULL")
     assert (vehicle, code) == ("unknown", "process_died")
 
 
@@ -65,7 +65,7 @@ def test_a_vehicle_of_any_name_has_a_folder_within_the_folder(tmp_path: Path) ->
             tmp_path, [empty_row(Job(f"{index}"), {}).model_copy(update={"vehicle": vehicle})], f"part-{index}"
         )
     assert len(list(tmp_path.glob("date=unknown/vehicle=*/*.parquet"))) == 5
-    assert {name for (name,) in asked(tmp_path, "SELECT vehicle FROM TABLE")} >= {"../../etc", "a/b", "x=1", "Ä ö"}
+    assert {name for (name,) in requested(tmp_path, "SELECT vehicle FROM TABLE")} >= {"../../etc", "a/b", "x=1", "Ä ö"}
 
 
 @pytest.mark.fault("a batch is stopped at any point", "no finished row is lost, and none is written twice")
@@ -81,7 +81,7 @@ def test_a_batch_that_ends_anywhere_is_gone_on_with(tmp_path: Path, count: int) 
         if row.url not in second.urls:
             second.add(row)
     second.finish()
-    assert asked(tmp_path, "SELECT count(*), count(DISTINCT url) FROM TABLE") == [(11, 11)]
+    assert requested(tmp_path, "SELECT count(*), count(DISTINCT url) FROM TABLE") == [(11, 11)]
     assert BatchFolder(tmp_path, ReplaySettings(), resume=True).urls == {row.url for row in rows(11)}
 
 
@@ -113,7 +113,7 @@ def test_tables_that_were_made_before_the_journal_was_emptied_are_not_made_twice
     second = BatchFolder(tmp_path, ReplaySettings(), resume=True)
     assert len(second.urls) == 4
     second.finish()
-    assert asked(tmp_path, "SELECT count(*) FROM TABLE") == [(4,)]
+    assert requested(tmp_path, "SELECT count(*) FROM TABLE") == [(4,)]
 
 
 def test_a_torn_or_damaged_line_of_the_journal_costs_its_own_window(tmp_path: Path) -> None:
@@ -126,7 +126,7 @@ def test_a_torn_or_damaged_line_of_the_journal_costs_its_own_window(tmp_path: Pa
     assert BatchFolder(tmp_path, ReplaySettings(), resume=True).urls == {"0.mcap"}
 
 
-def test_a_folder_with_a_batch_is_gone_on_with_only_if_asked_and_on_the_same_terms(tmp_path: Path) -> None:
+def test_a_folder_with_a_batch_is_gone_on_with_only_on_request_and_on_the_same_terms(tmp_path: Path) -> None:
     batch = BatchFolder(tmp_path, ReplaySettings(), resume=True)
     batch.add(next(rows(1)))
     with pytest.raises(UsageError, match="--resume"):
@@ -185,10 +185,10 @@ def test_a_folder_without_a_row_holds_no_batch(tmp_path: Path, monkeypatch: pyte
 @pytest.mark.fault(
     "tables of a batch are damaged, its folder cannot be written", "the message says which file, and what to do"
 )
-def test_what_cannot_be_read_or_written_is_told(tmp_path: Path) -> None:
-    begun_batch = BatchFolder(tmp_path / "batch", ReplaySettings(), resume=False)
+def test_what_cannot_be_read_or_written_is_reported(tmp_path: Path) -> None:
+    started_batch = BatchFolder(tmp_path / "batch", ReplaySettings(), resume=False)
     for row in rows(4):
-        begun_batch.add(row)
+        started_batch.add(row)
     (table,) = (tmp_path / "batch").glob("date=*/vehicle=*/*.parquet")
     table.write_bytes(b"PAR1 rubbish PAR1")
     with pytest.raises(SourceError, match="evaluated again"):

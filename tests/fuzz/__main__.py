@@ -18,7 +18,7 @@ import time
 import warnings
 from pathlib import Path
 
-from fuzz.corpus import CORPUS, MAX_KEPT_BYTES, inputs_of
+from fuzz.corpus import CORPUS, MAX_RETAINED_BYTES, inputs_of
 from fuzz.loop import Fuzzer, name_of, smallest_with_all_arcs
 from fuzz.targets import TARGETS
 
@@ -81,7 +81,7 @@ def _supervised(name: str, options: argparse.Namespace) -> bool:
             process = subprocess.Popen(
                 [sys.executable, "-m", "fuzz", *arguments, *(["--keep"] if options.keep else [])]
             )
-            code = _awaited(process, last)
+            code = _pending(process, last)
             if code in (0, BROKEN):
                 return held and code == 0
             held, seed = False, seed + 1
@@ -90,7 +90,7 @@ def _supervised(name: str, options: argparse.Namespace) -> bool:
     return held
 
 
-def _awaited(process: subprocess.Popen[bytes], last: Path) -> int:
+def _pending(process: subprocess.Popen[bytes], last: Path) -> int:
     while True:
         try:
             return process.wait(SILENT_S)
@@ -131,7 +131,7 @@ def _fuzz(options: argparse.Namespace) -> int:
         for old in folder.iterdir():
             old.unlink()
         seeds = set(target.seeds())
-        for data in smallest_with_all_arcs(target, work, [*target.seeds(), *report.corpus], MAX_KEPT_BYTES):
+        for data in smallest_with_all_arcs(target, work, [*target.seeds(), *report.corpus], MAX_RETAINED_BYTES):
             if data not in seeds:
                 (folder / name_of(data)).write_bytes(data)
     return BROKEN if report.findings else 0

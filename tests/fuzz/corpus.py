@@ -9,12 +9,12 @@ from fuzz.loop import Target
 CORPUS = Path(__file__).resolve().parent / "corpus"
 """A folder for each target, a file for each input, named by its hash."""
 
-MAX_KEPT_BYTES = 8192
+MAX_RETAINED_BYTES = 8192
 """Of an input that is kept: none has to be large to lead somewhere."""
 
 
 def inputs_of(target: Target) -> list[bytes]:
     """All that are known of a target, those made by hand first."""
     folder = CORPUS / target.name
-    found = [path.read_bytes() for path in sorted(folder.iterdir())] if folder.is_dir() else []
-    return [*target.seeds(), *found]
+    result = [path.read_bytes() for path in sorted(folder.iterdir())] if folder.is_dir() else []
+    return [*target.seeds(), *result]

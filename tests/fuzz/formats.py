@@ -80,13 +80,13 @@ def book(parts: list[tuple[Any, Any]]) -> bytes:
     """A book of these entries and results (or None)."""
     lines, previous = [], GENESIS
     for entry, result in parts:
-        told = deepened(canonical(result))
+        reported = deepened(canonical(result))
         if isinstance(entry, dict):
-            hashed = None if result is None else hashlib.sha256(told).hexdigest()
+            hashed = None if result is None else hashlib.sha256(reported).hexdigest()
             entry = {**entry, "previous_sha256": previous, "result_sha256": hashed}
         document = deepened(canonical(entry))
         previous = hashlib.sha256(document).hexdigest()
-        lines.append(previous.encode() + b" " + document + b"\t" + told + b"\n")
+        lines.append(previous.encode() + b" " + document + b"\t" + reported + b"\n")
     return b"".join(lines)
 
 
@@ -103,10 +103,12 @@ def in_archive(rng: Random, data: bytes) -> bytes:
     stream = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(data)) as given, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as made:
         names = given.namelist()
-        chosen = rng.choice(names)
+        selected = rng.choice(names)
         for name in names:
             body = given.read(name)
-            made.writestr(name, mutated_bytes(rng, body, given.read(rng.choice(names)), ()) if name == chosen else body)
+            made.writestr(
+                name, mutated_bytes(rng, body, given.read(rng.choice(names)), ()) if name == selected else body
+            )
     return stream.getvalue()
 
 
@@ -134,13 +136,13 @@ def in_records(rng: Random, data: bytes) -> bytes:
 
 def records_of(data: bytes) -> list[Part]:
     """The records of the data section of a sound file."""
-    found: list[Part] = []
+    detected: list[Part] = []
     at = len(MAGIC)
     while True:
         opcode, length = struct.unpack_from("<BQ", data, at)
         if opcode == Opcode.DATA_END:
-            return found
-        found.append((opcode, data[at + 9 : at + 9 + length]))
+            return detected
+        detected.append((opcode, data[at + 9 : at + 9 + length]))
         at += 9 + length
 
 

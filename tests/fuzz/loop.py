@@ -60,7 +60,7 @@ class Target:
     read: Callable[[bytes, Path], object]
     seeds: Callable[[], Sequence[bytes]]
     mutations: tuple[Mutation, ...] = ()
-    words: tuple[bytes, ...] = ()
+    labels: tuple[bytes, ...] = ()
     refusals: tuple[type[Exception], ...] = (CoecError,)
 
 
@@ -171,7 +171,7 @@ class Fuzzer:
             # The input may not be of the format any more, or the format have no place for what was put into it.
             with suppress(Exception):
                 return rng.choice(self._target.mutations)(rng, data)[:MAX_INPUT_BYTES]
-        return mutated_bytes(rng, data, rng.choice(corpus), self._target.words)
+        return mutated_bytes(rng, data, rng.choice(corpus), self._target.labels)
 
     def _try(self, data: bytes) -> None:
         report = self.report
@@ -219,19 +219,19 @@ def smallest_with_all_arcs(target: Target, folder: Path, inputs: Sequence[bytes]
     """Few of the inputs of at most so many bytes that take every way that all of these take: greedily, the shortest
     first where two take as many new ones."""
     arcs = Arcs(PACKAGE)
-    ways: dict[bytes, set[tuple[str, int, int]]] = {}
+    directions: dict[bytes, set[tuple[str, int, int]]] = {}
     for data in dict.fromkeys(inputs):
         if len(data) <= max_bytes:
             with arcs, suppress(Exception):
                 target.read(data, folder)
-            ways[data] = {arc[:3] for arc in arcs.taken}
-    chosen: list[bytes] = []
-    missing = set().union(*ways.values())
+            directions[data] = {arc[:3] for arc in arcs.taken}
+    selected: list[bytes] = []
+    missing = set().union(*directions.values())
     while missing:
-        best = max(ways, key=lambda data: (len(ways[data] & missing), -len(data), data))
-        chosen.append(best)
-        missing -= ways.pop(best)
-    return chosen
+        best = max(directions, key=lambda data: (len(directions[data] & missing), -len(data), data))
+        selected.append(best)
+        missing -= directions.pop(best)
+    return selected
 
 
 def name_of(data: bytes) -> str:

@@ -47,10 +47,10 @@ MAX_BYTES = 2**18
 """Of an input: what is wrong with larger ones is told by tests of their own."""
 
 
-def mutated_bytes(rng: Random, data: bytes, other: bytes, words: Sequence[bytes]) -> bytes:
+def mutated_bytes(rng: Random, data: bytes, other: bytes, labels: Sequence[bytes]) -> bytes:
     """One to eight changes, one after the other; `other` is another input, `words` what readers look for."""
     for _ in range(2 ** rng.randrange(4)):
-        data = rng.choice(_CHANGES)(rng, data, other, words)
+        data = rng.choice(_CHANGES)(rng, data, other, labels)
     return data[:MAX_BYTES]
 
 
@@ -83,15 +83,15 @@ def deepened(text: bytes) -> bytes:
 
 
 def _places(value: Any) -> list[tuple[Any, Any]]:
-    found: list[tuple[Any, Any]] = []
+    result: list[tuple[Any, Any]] = []
     waiting = [value]
     while waiting:
         one = waiting.pop()
         if isinstance(one, dict | list):
-            found += [(one, key) for key in (one if isinstance(one, dict) else range(len(one)))]
+            result += [(one, key) for key in (one if isinstance(one, dict) else range(len(one)))]
             waiting += one.values() if isinstance(one, dict) else one
     # A removal may have taken the place of another: only what is there still.
-    return [(one, key) for one, key in found if (key in one if isinstance(one, dict) else key < len(one))]
+    return [(one, key) for one, key in result if (key in one if isinstance(one, dict) else key < len(one))]
 
 
 def _odd(rng: Random, value: Any) -> Any:
@@ -116,8 +116,8 @@ def _odd(rng: Random, value: Any) -> Any:
     return copy.deepcopy(rng.choice(rng.choice(pools)))
 
 
-def _flip(rng: Random, data: bytes, other: bytes, words: Sequence[bytes]) -> bytes:
-    del other, words
+def _flip(rng: Random, data: bytes, other: bytes, labels: Sequence[bytes]) -> bytes:
+    del other, labels
     if not data:
         return bytes([rng.randrange(256)])
     changed = bytearray(data)
@@ -125,9 +125,9 @@ def _flip(rng: Random, data: bytes, other: bytes, words: Sequence[bytes]) -> byt
     return bytes(changed)
 
 
-def _integer(rng: Random, data: bytes, other: bytes, words: Sequence[bytes]) -> bytes:
+def _integer(rng: Random, data: bytes, other: bytes, labels: Sequence[bytes]) -> bytes:
     """A number that is stored in bytes, often where it would be aligned."""
-    del other, words
+    del other, labels
     form = rng.choice(("<B", "<H", ">H", "<I", ">I", "<Q", ">Q"))
     size = struct.calcsize(form)
     if len(data) < size:
@@ -139,42 +139,42 @@ def _integer(rng: Random, data: bytes, other: bytes, words: Sequence[bytes]) -> 
     return data[:at] + struct.pack(form, new) + data[at + size :]
 
 
-def _digits(rng: Random, data: bytes, other: bytes, words: Sequence[bytes]) -> bytes:
+def _digits(rng: Random, data: bytes, other: bytes, labels: Sequence[bytes]) -> bytes:
     """A number that is written in digits."""
-    del other, words
+    del other, labels
     numbers = list(re.finditer(rb"-?\d+(\.\d+)?", data))
     if not numbers:
         return data
-    chosen = rng.choice(numbers)
+    selected = rng.choice(numbers)
     new = rng.choice((str(rng.choice(INTEGERS)), f"-{rng.choice(INTEGERS)}", str(rng.choice(FLOATS)), "9" * 5000, ""))
-    return data[: chosen.start()] + new.encode() + data[chosen.end() :]
+    return data[: selected.start()] + new.encode() + data[selected.end() :]
 
 
-def _cut(rng: Random, data: bytes, other: bytes, words: Sequence[bytes]) -> bytes:
-    del other, words
+def _cut(rng: Random, data: bytes, other: bytes, labels: Sequence[bytes]) -> bytes:
+    del other, labels
     begin = rng.randrange(len(data) + 1)
     length = rng.choice((1, 2, 4, 8, 16, 64, len(data)))
     return data[:begin] + data[begin + length :]
 
 
-def _repeat(rng: Random, data: bytes, other: bytes, words: Sequence[bytes]) -> bytes:
-    del other, words
+def _repeat(rng: Random, data: bytes, other: bytes, labels: Sequence[bytes]) -> bytes:
+    del other, labels
     begin = rng.randrange(len(data) + 1)
     piece = data[begin : begin + rng.choice((1, 2, 4, 8, 16, 64))]
     return data[:begin] + piece * rng.choice((1, 2, 10, 1000)) + data[begin:]
 
 
-def _splice(rng: Random, data: bytes, other: bytes, words: Sequence[bytes]) -> bytes:
-    del words
+def _splice(rng: Random, data: bytes, other: bytes, labels: Sequence[bytes]) -> bytes:
+    del labels
     begin, end = sorted(rng.randrange(len(other) + 1) for _ in range(2))
     at = rng.randrange(len(data) + 1)
     return data[:at] + other[begin:end] + data[at + (end - begin if rng.randrange(2) else 0) :]
 
 
-def _word(rng: Random, data: bytes, other: bytes, words: Sequence[bytes]) -> bytes:
+def _word(rng: Random, data: bytes, other: bytes, labels: Sequence[bytes]) -> bytes:
     del other
     pool = (
-        *words,
+        *labels,
         b"\0",
         b"\n",
         b"\xff" * 8,

@@ -182,8 +182,8 @@ def _cdr(data: bytes, folder: Path) -> None:
     """The first byte chooses the type of the message, and whether the times of points are said."""
     del folder
     kind = data[0] if data else 0
-    said = TIME_SAID if kind >= 2**7 else None
-    _inspected(message_decoding.decode(MESSAGES[kind % 2**7 % len(MESSAGES)], data[1:], LIMITS, point_time=said))
+    reported = TIME_REPORTED if kind >= 2**7 else None
+    _inspected(message_decoding.decode(MESSAGES[kind % 2**7 % len(MESSAGES)], data[1:], LIMITS, point_time=reported))
 
 
 def _transforms(data: bytes, folder: Path) -> None:
@@ -203,7 +203,7 @@ def _transforms_seeds() -> list[bytes]:
     return [transforms(), transforms(*vehicle), transforms(vehicle[0], wheel, vehicle[1])]
 
 
-TIME_SAID = PointTimeConfig(field="t", unit="us", base="clock")
+TIME_REPORTED = PointTimeConfig(field="t", unit="us", base="clock")
 XYZ: Columns = [("x", "<f4", [1, 4]), ("y", "<f4", [2, 5]), ("z", "<f4", [3, 6])]
 
 
@@ -341,13 +341,13 @@ def _nominal(data: bytes, folder: Path) -> None:
     elif kind == b"t":
         transforms = StaticTransforms()
         transforms.add(decode_static_transforms(body))
-        found = transforms.transform("camera", "lidar")
+        detected = transforms.transform("camera", "lidar")
         transforms.doubts("camera", "lidar")
-        assert found is None or np.isfinite(found).all()
+        assert detected is None or np.isfinite(detected).all()
     else:
         (folder / NOMINAL_FILE).write_bytes(body)
-        for kept in DiscoveryStore(folder).load(AWAITING).values():
-            rig_of(kept.pair)
+        for retained in DiscoveryStore(folder).load(AWAITING).values():
+            rig_of(retained.pair)
 
 
 AWAITING = Config.model_validate(
@@ -363,9 +363,9 @@ def _nominal_seeds() -> list[bytes]:
         {"name": "front", "camera": camera, "lidar": lidar, "T_camera_lidar": np.eye(4).tolist()}
     )
     with tempfile.TemporaryDirectory() as folder:
-        kept = DiscoveryStore(Path(folder))
-        kept.update(DiscoveredPair(pair, {"T_camera_lidar": "/tf_static"}), AWAITING.awaited[0], AWAITING, 5)
-        kept.flush()
+        retained = DiscoveryStore(Path(folder))
+        retained.update(DiscoveredPair(pair, {"T_camera_lidar": "/tf_static"}), AWAITING.awaited[0], AWAITING, 5)
+        retained.flush()
         state = (Path(folder) / NOMINAL_FILE).read_bytes()
     return [b"i" + _camera_info(), b"t" + _tf(), b"k" + state]
 
@@ -534,8 +534,8 @@ def _command(data: bytes, folder: Path) -> None:
     assert sender.isascii()
     assert sender.isprintable()
     assert len(sender) <= authorization.MAX_SENDER
-    for told in authorization.parse_payload(name, data[cut:]).values():
-        to_json_of(told)
+    for report in authorization.parse_payload(name, data[cut:]).values():
+        to_json_of(report)
 
 
 def to_json_of(value: object) -> bytes:
@@ -580,8 +580,8 @@ def _started(folder: Path) -> None:
     state = store.state
     accepted = None if state.accepted is None else result_of(state.accepted, ESTIMATE_RIG, VEHICLE)
     to_json(extrinsic_of(VEHICLE, ESTIMATE_RIG, state, accepted, 0.0, "0"))
-    for kept in store.publishable_records().entries:
-        to_json(kept.chained)
+    for retained in store.publishable_records().entries:
+        to_json(retained.chained)
     for check in store.publishable_records().checks:
         to_json(check)
     for result in store.publishable_records().results:
@@ -764,7 +764,7 @@ def _worker_seeds() -> list[bytes]:
 
 # --- all --------------------------------------------------------------------------------------------------------------
 
-YAML_WORDS = (
+YAML_TEXT = (
     b"!!python/object:os.system ",
     b"&a [*a]",
     b"*a",
@@ -776,7 +776,7 @@ YAML_WORDS = (
     b"0x",
     b"\t",
 )
-JSON_WORDS = (b'"', b"null", b"NaN", b"{}", b"[]", b"\\ud800")
+JSON_TEXT = (b'"', b"null", b"NaN", b"{}", b"[]", b"\\ud800")
 
 TARGETS: Final = {
     target.name: target
@@ -785,33 +785,29 @@ TARGETS: Final = {
         Target("lidar", lambda data, _: _inspected(decode_lidar(data, LIMITS)), _lidar_seeds, (in_msgpack,)),
         Target("ego", lambda data, _: _inspected(decode_ego(data, LIMITS)), _ego_seeds, (in_msgpack,)),
         Target(
-            "cdr", _cdr, _cdr_seeds, words=(*(name.encode() for name in ENCODINGS), b"timestamp", b"time_offset_ns")
+            "cdr", _cdr, _cdr_seeds, labels=(*(name.encode() for name in ENCODINGS), b"timestamp", b"time_offset_ns")
         ),
-        Target("transforms", _transforms, _transforms_seeds, words=(b"odom\0", b"base_link\0")),
+        Target("transforms", _transforms, _transforms_seeds, labels=(b"odom\0", b"base_link\0")),
         Target(
-            "pcd", lambda data, folder: _cloud_file(data, folder, "pcd"), _pcd_seeds, words=(b"FIELDS", b"_", b"ring")
+            "pcd", lambda data, folder: _cloud_file(data, folder, "pcd"), _pcd_seeds, labels=(b"FIELDS", b"_", b"ring")
         ),
         Target(
-            "npy", lambda data, folder: _cloud_file(data, folder, "npy"), _npy_seeds, words=(b"'<f8'", b"True", b"(")
+            "npy", lambda data, folder: _cloud_file(data, folder, "npy"), _npy_seeds, labels=(b"'<f8'", b"True", b"(")
         ),
         Target("npz", lambda data, folder: _cloud_file(data, folder, "npz"), _npz_seeds, (in_archive,)),
-        Target("manifest", _manifest, _manifest_seeds, (in_yaml,), (*YAML_WORDS, b"depth", b"double_sphere", b"mei")),
+        Target("manifest", _manifest, _manifest_seeds, (in_yaml,), (*YAML_TEXT, b"depth", b"double_sphere", b"mei")),
         Target("kitti", _kitti, lambda: [b"R: 1 0 0\nT: 1 2 3\n", b"2013-05-28 08:46:02.904483072\n"]),
         Target("bag", _bag, _bag_seeds, (in_records,), (b"lz4", b"zstd", b"equidistant")),
-        Target(
-            "nominal", _nominal, _nominal_seeds, (behind(1, checksummed),), (b"equidistant", b"camera", *JSON_WORDS)
-        ),
+        Target("nominal", _nominal, _nominal_seeds, (behind(1, checksummed),), (b"equidistant", b"camera", *JSON_TEXT)),
         Target("window", _window, _window_seeds, (in_records,), (b"lz4", b"zstd")),
-        Target("selector", _selector, _selector_seeds, words=(b";", b"=", b"/", b"@v1", b"*", b"?", b"_")),
-        Target("command", _command, _command_seeds, (behind(7, in_msgpack), behind(7, in_json)), JSON_WORDS),
-        Target("state", _state, _state_seeds, (checksummed, checksummed, in_json), JSON_WORDS),
-        Target(
-            "books", _books, _books_seeds, (behind(1, chained), behind(1, chained), behind(1, in_lines)), JSON_WORDS
-        ),
-        Target("baseline", _baseline, _baseline_seeds, (checksummed,), JSON_WORDS),
-        Target("configuration", _configuration, _configuration_seeds, (in_yaml,), YAML_WORDS),
-        Target("zenoh", _zenoh, _zenoh_seeds, (in_json,), (b"endpoints", b"peer:", b"//", b"/*", *JSON_WORDS)),
-        Target("model_card", _model_card, _model_card_seeds, (in_yaml,), YAML_WORDS),
+        Target("selector", _selector, _selector_seeds, labels=(b";", b"=", b"/", b"@v1", b"*", b"?", b"_")),
+        Target("command", _command, _command_seeds, (behind(7, in_msgpack), behind(7, in_json)), JSON_TEXT),
+        Target("state", _state, _state_seeds, (checksummed, checksummed, in_json), JSON_TEXT),
+        Target("books", _books, _books_seeds, (behind(1, chained), behind(1, chained), behind(1, in_lines)), JSON_TEXT),
+        Target("baseline", _baseline, _baseline_seeds, (checksummed,), JSON_TEXT),
+        Target("configuration", _configuration, _configuration_seeds, (in_yaml,), YAML_TEXT),
+        Target("zenoh", _zenoh, _zenoh_seeds, (in_json,), (b"endpoints", b"peer:", b"//", b"/*", *JSON_TEXT)),
+        Target("model_card", _model_card, _model_card_seeds, (in_yaml,), YAML_TEXT),
         Target(
             "worker",
             _worker,

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from fuzz.corpus import MAX_KEPT_BYTES, inputs_of
+from fuzz.corpus import MAX_RETAINED_BYTES, inputs_of
 from fuzz.loop import MAX_BYTES, MAX_CPU_S, Fuzzer, Report, tried
 from fuzz.targets import TARGETS
 
@@ -183,9 +183,9 @@ def test_what_a_target_begins_with_is_taken(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_what_is_kept_is_small(name: str) -> None:
+def test_what_is_retained_is_small(name: str) -> None:
     made_by_hand = len(TARGETS[name].seeds())
-    assert all(len(data) <= MAX_KEPT_BYTES for data in inputs_of(TARGETS[name])[made_by_hand:])
+    assert all(len(data) <= MAX_RETAINED_BYTES for data in inputs_of(TARGETS[name])[made_by_hand:])
 
 
 @pytest.mark.slow

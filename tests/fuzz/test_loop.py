@@ -38,7 +38,7 @@ def letter_by_letter(data: bytes, folder: Path) -> None:
     raise SourceError("not at all")
 
 
-LETTERS = Target("letters", letter_by_letter, lambda: [b"AAAA"], words=(b"F", b"U", b"Z", b"Q", b"X"))
+LETTERS = Target("letters", letter_by_letter, lambda: [b"AAAA"], labels=(b"F", b"U", b"Z", b"Q", b"X"))
 
 
 def fuzzed(target: Target, folder: Path, seed: int = 1, executions: int = ENOUGH) -> Report:
@@ -47,7 +47,7 @@ def fuzzed(target: Target, folder: Path, seed: int = 1, executions: int = ENOUGH
     return fuzzer.mutate(lambda report: report.executions >= executions or bool(report.findings))
 
 
-def test_what_leads_further_is_kept_until_the_fault_is_found(tmp_path: Path) -> None:
+def test_what_leads_further_is_retained_until_the_fault_is_detected(tmp_path: Path) -> None:
     report = fuzzed(LETTERS, tmp_path)
     (finding,) = report.findings.values()
     assert finding.place == "ZeroDivisionError outside"
@@ -63,8 +63,8 @@ def test_the_same_seed_goes_the_same_way(tmp_path: Path) -> None:
 
 def test_few_inputs_stand_for_all(tmp_path: Path) -> None:
     inputs = [b"A", b"B", b"C", b"{", b"\x80"]
-    chosen = smallest_with_all_arcs(TARGETS["ego"], tmp_path, [*TARGETS["ego"].seeds(), *inputs], 1000)
-    assert 1 < len(chosen) < 5
+    selected = smallest_with_all_arcs(TARGETS["ego"], tmp_path, [*TARGETS["ego"].seeds(), *inputs], 1000)
+    assert 1 < len(selected) < 5
 
 
 def test_an_input_that_takes_long_is_a_finding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,7 +92,7 @@ def test_an_input_that_takes_much_memory_is_a_finding(tmp_path: Path, monkeypatc
     assert fuzzer.replay([b"", b"1" * 64]).findings.keys() == {"memory"}
 
 
-def test_the_smallest_input_of_a_finding_is_told(tmp_path: Path) -> None:
+def test_the_smallest_input_of_a_finding_is_reported(tmp_path: Path) -> None:
     fuzzer = Fuzzer(LETTERS, tmp_path, 1, code=HERE)
     report = fuzzer.replay([b"FUZZZ", b"FUZ", b"FUZZ"])
     assert report.findings.keys() == {"ZeroDivisionError outside"}
@@ -140,7 +140,7 @@ def test_a_forged_archive_has_the_right_sums() -> None:
             assert archive.testzip() is None
 
 
-def test_lists_in_one_another_are_as_deep_as_was_asked() -> None:
+def test_lists_in_one_another_are_as_deep_as_was_requested() -> None:
     assert deepened(b'{"a": "@deep3@", "b": "@deep0@"}') == b'{"a": [[[]]], "b": }'
     assert any(b"[" * 100 in in_json(Random(seed), b'{"a": 1}') for seed in range(400))
     assert any(b"[" * 30 in in_yaml(Random(seed), b"a: 1") for seed in range(400))

@@ -12,8 +12,8 @@ def test_are_those_of_numpy_in_every_direction() -> None:
     xyz_m = np.concatenate([rng.normal(size=(9000, 3)) * rng.uniform(0.1, 90.0, (9000, 1)), axes]).astype(np.float32)
     x, y, z = xyz_m.astype(np.float64).T
     seen = bearings(xyz_m)
-    apart = np.angle(np.exp(1j * (seen.azimuth - np.arctan2(y, x))))
-    assert np.abs(apart).max() < 1e-6
+    separation = np.angle(np.exp(1j * (seen.azimuth - np.arctan2(y, x))))
+    assert np.abs(separation).max() < 1e-6
     assert np.abs(seen.elevation - np.arctan2(z, np.hypot(x, y))).max() < 1e-6
     np.testing.assert_allclose(seen.range_m, np.sqrt(x * x + y * y + z * z), rtol=1e-6)
 

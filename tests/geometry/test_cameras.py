@@ -311,10 +311,10 @@ def test_the_domain_ends_where_it_should(camera: Camera, limit_rad: float) -> No
     epsilon_rad = 2e-6
     for azimuth_rad in (0.3, 2.0, -1.2):
         inside = at_angle(limit_rad - epsilon_rad, azimuth_rad)
-        outside = at_angle(min(limit_rad + epsilon_rad, math.pi), azimuth_rad)
+        context = at_angle(min(limit_rad + epsilon_rad, math.pi), azimuth_rad)
         assert project(camera, inside)[1].all()
-        assert not project(camera, outside)[1].any()
-        assert not project(camera, 50.0 * outside)[1].any()
+        assert not project(camera, context)[1].any()
+        assert not project(camera, 50.0 * context)[1].any()
 
 
 @every_variant
@@ -349,7 +349,7 @@ def test_pixels_beyond_the_image_of_the_domain_have_no_ray(camera: Camera) -> No
     np.testing.assert_array_equal(rays[~seen], np.tile([0.0, 0.0, 1.0], ((~seen).sum(), 1)))
 
 
-def test_a_point_outside_the_image_is_valid_but_not_in_it() -> None:
+def test_a_point_beyond_the_image_is_valid_but_not_in_it() -> None:
     camera = CAMERAS["pinhole"]
     uv_px, valid = project(camera, np.array([[5.0, 0.0, 1.0]]))
     assert valid.all()
@@ -417,10 +417,10 @@ def test_polar_angle_is_the_arc_tangent(angle: float) -> None:
 def test_polar_angle_in_single_precision_is_as_good_as_that_is() -> None:
     angle_rad = np.random.default_rng(5).uniform(0.0, math.pi, 20_000)
     radius, z = np.sin(angle_rad).astype(np.float32), np.cos(angle_rad).astype(np.float32)
-    found = _polar_angles(radius, z)
-    assert found.dtype == np.float32
+    result = _polar_angles(radius, z)
+    assert result.dtype == np.float32
     expected = np.arctan2(radius.astype(np.float64), z.astype(np.float64))
-    assert np.abs(found - expected).max() < 2 * np.spacing(np.float32(math.pi))
+    assert np.abs(result - expected).max() < 2 * np.spacing(np.float32(math.pi))
 
 
 @njit(cache=False)

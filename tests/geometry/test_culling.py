@@ -55,7 +55,7 @@ def frames_of(xyz: NDArray[np.float32]) -> BinnedFrames:
     )  # fmt: skip
 
 
-def kept_at(bundles: Bundles, pose: NDArray[np.float64]) -> NDArray[np.bool_]:
+def retained_at(bundles: Bundles, pose: NDArray[np.float64]) -> NDArray[np.bool_]:
     """(B,) whether a bundle may be in view at a pose (4, 4)."""
     return np.asarray(bundles.axis @ pose[2, :3] >= bundles.least_cosine_at(pose))
 
@@ -70,9 +70,9 @@ def test_no_point_of_the_image_is_left_out_and_much_else_is() -> None:
     shares = []
     for pose in poses(40):
         uv_px, valid = project(CAMERA, xyz.T.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3])
-        kept = kept_at(bundles, pose)
-        assert kept[owner[valid & in_image(CAMERA, uv_px)]].all()
-        shares.append(kept.mean())
+        retained = retained_at(bundles, pose)
+        assert retained[owner[valid & in_image(CAMERA, uv_px)]].all()
+        shares.append(retained.mean())
     assert np.mean(shares) < 0.9
 
 
@@ -88,15 +88,15 @@ def test_a_pose_that_shifts_farther_than_was_allowed_for_leaves_nothing_out() ->
     bundles = bundle(sweeps(3), FIRST, HALF_VIEW_RAD, SHIFT_M)
     far = np.eye(4)
     far[0, 3] = SHIFT_M + 0.01
-    assert kept_at(bundles, far).all()
-    assert not kept_at(bundles, np.eye(4)).all()
+    assert retained_at(bundles, far).all()
+    assert not retained_at(bundles, np.eye(4)).all()
 
 
 def test_points_that_are_not_numbers_keep_their_bundle() -> None:
     xyz = sweeps(4)
     xyz[:, ::BUNDLE] = np.nan
-    kept = kept_at(bundle(xyz, FIRST, HALF_VIEW_RAD, SHIFT_M), np.eye(4))
-    assert kept[: -(-COUNTS[0] // BUNDLE)].all()
+    retained = retained_at(bundle(xyz, FIRST, HALF_VIEW_RAD, SHIFT_M), np.eye(4))
+    assert retained[: -(-COUNTS[0] // BUNDLE)].all()
 
 
 @pytest.mark.parametrize("scale_m", [0.0, 1e-12, 1e6])
@@ -108,17 +108,17 @@ def test_the_order_is_stable_and_complete(scale_m: float) -> None:
     assert (np.diff(azimuth) > -0.1).all()
 
 
-def test_no_point_that_a_pose_of_a_reach_brings_into_the_image_is_outside_of_the_cone() -> None:
+def test_no_point_that_a_pose_of_a_reach_brings_into_the_image_is_beyond_the_cone() -> None:
     xyz, start, rng = sweeps(6), se3.perturbation(np.array([0.4, -1.1, 0.3, 0.2, -0.5, 0.4])), np.random.default_rng(8)
     half_view_rad = half_field_of_view_rad(CAMERA, np.ones((CAMERA.height, CAMERA.width), np.bool_))
-    kept = within_cone(xyz, start, half_view_rad + 0.3, 0.5)
-    assert 0.05 < kept.mean() < 0.8
+    retained = within_cone(xyz, start, half_view_rad + 0.3, 0.5)
+    assert 0.05 < retained.mean() < 0.8
     for _ in range(30):
         turn, shift = rng.normal(size=(2, 3))
         xi = np.concatenate([0.3 * turn / np.linalg.norm(turn), 0.5 * shift / np.linalg.norm(shift)])
         pose = se3.perturb(start, xi)
         uv_px, valid = project(CAMERA, xyz.T.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3])
-        assert kept[valid & in_image(CAMERA, uv_px)].all()
+        assert retained[valid & in_image(CAMERA, uv_px)].all()
 
 
 def test_what_is_no_number_is_never_left_out() -> None:

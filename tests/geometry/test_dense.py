@@ -9,8 +9,8 @@ from coec.geometry import linalg
 
 
 def _stack(n: int) -> np.ndarray:
-    drawn = np.random.default_rng(n).normal(size=(3, 4, n, n))
-    return np.asarray(drawn @ np.swapaxes(drawn, -1, -2) + 0.1 * np.eye(n))
+    samples = np.random.default_rng(n).normal(size=(3, 4, n, n))
+    return np.asarray(samples @ np.swapaxes(samples, -1, -2) + 0.1 * np.eye(n))
 
 
 @pytest.mark.parametrize("n", [1, 6, 13])

@@ -34,7 +34,7 @@ def test_a_pinhole_is_met_exactly() -> None:
         ),
     ],
 )
-def test_a_double_sphere_is_found_again(xi: float, alpha: float) -> None:
+def test_a_double_sphere_is_recovered(xi: float, alpha: float) -> None:
     source = cameras.build("double_sphere", **SMALL, xi=xi, alpha=alpha)
     fit = fit_double_sphere(source)
     assert fit.residual_max_px < 1e-6

@@ -42,7 +42,7 @@ def test_a_double_sphere_is_met_within_hundredths_of_a_pixel(xi: float, alpha: f
     assert fit.camera.fx != pytest.approx(500.0, rel=0.01)  # a focal length means what its model says
 
 
-def test_a_kannala_brandt_is_found_again() -> None:
+def test_a_kannala_brandt_is_recovered() -> None:
     source = cameras.build("kannala_brandt", **SMALL, k1=-0.0978, k2=0.1414, k3=-0.1484, k4=0.0559)
     fit = fitted(source)
     assert isinstance(source, KannalaBrandt)
@@ -59,7 +59,7 @@ def test_a_kannala_brandt_is_found_again() -> None:
     ],
     ids=lambda camera: type(camera).__name__,
 )
-def test_what_is_left_is_told_as_it_is_between_the_pixels_of_the_fit(source: Camera) -> None:
+def test_what_is_left_is_reported_as_it_is_between_the_pixels_of_the_fit(source: Camera) -> None:
     fit = fitted(source)
     uv_px = np.random.default_rng(7).uniform([0, 0], [source.width - 1, source.height - 1], (20_000, 2))
     rays, seen = unproject(source, uv_px)

@@ -107,14 +107,14 @@ def test_who_save_a_kernel_for_different_types_at_once_do_not_get_the_code_of_ea
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cache_file: Any = IndexDataCacheFile
-    look, both_looked = cache_file._load_index, threading.Barrier(2)
+    observation, both_checked = cache_file._load_index, threading.Barrier(2)
 
     def hesitate(self: object) -> Any:
-        found = look(self)
+        detected = observation(self)
         # Where one has to wait until the other has saved, nobody comes to meet it here.
         with suppress(threading.BrokenBarrierError):
-            both_looked.wait(0.2)
-        return found
+            both_checked.wait(0.2)
+        return detected
 
     def save(types: str) -> None:
         cache_file(str(tmp_path), "kernel", "stamp").save(types, f"code for {types}")
@@ -122,5 +122,5 @@ def test_who_save_a_kernel_for_different_types_at_once_do_not_get_the_code_of_ea
     with monkeypatch.context() as patched, ThreadPoolExecutor(2) as pool:
         patched.setattr(cache_file, "_load_index", hesitate)
         list(pool.map(save, ("float32", "float64")))
-    kept = cache_file(str(tmp_path), "kernel", "stamp")
-    assert [kept.load(types) for types in ("float32", "float64")] == ["code for float32", "code for float64"]
+    retained = cache_file(str(tmp_path), "kernel", "stamp")
+    assert [retained.load(types) for types in ("float32", "float64")] == ["code for float32", "code for float64"]

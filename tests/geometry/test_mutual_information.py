@@ -72,11 +72,11 @@ def by_oracle(frames: BinnedFrames, pose: NDArray[np.float64]) -> list[tuple[flo
 @pytest.mark.parametrize("model", MODELS)
 def test_every_camera_model_agrees_with_the_plain_form(model: str) -> None:
     frames = frames_of(CAMERAS[model], (5000, 1, 3001), 32, 32)
-    found = mutual_information(frames, POSE)
+    result = mutual_information(frames, POSE)
     expected = by_oracle(frames, POSE)
-    assert found.points.tolist() == [points for _, points in expected]
-    assert found.points[0] > 500
-    assert found.mi == pytest.approx([mi for mi, _ in expected], abs=1e-9)
+    assert result.points.tolist() == [points for _, points in expected]
+    assert result.points[0] > 500
+    assert result.mi == pytest.approx([mi for mi, _ in expected], abs=1e-9)
 
 
 OF_TWO_BYTES = (pytest.param(256, 300, marks=pytest.mark.slow), pytest.param(1000, 5, marks=pytest.mark.slow))
@@ -108,18 +108,18 @@ def test_the_number_of_threads_does_not_change_a_bit() -> None:
     assert results[0] == results[1]
 
 
-def test_depth_that_tells_the_range_gives_the_entropy_of_the_range() -> None:
+def test_depth_that_reports_the_range_gives_the_entropy_of_the_range() -> None:
     frames = frames_of(CAMERAS["pinhole"], (5000,), 8, 8, blank=0.0)
     joint = joint_histograms(frames, POSE)[0]
-    told = np.diag(joint.sum(axis=0)).astype(float)
-    p = told / told.sum()
+    reported = np.diag(joint.sum(axis=0)).astype(float)
+    p = reported / reported.sum()
     assert entropy(p.sum(axis=0)) + entropy(p.sum(axis=1)) - entropy(p.ravel()) == pytest.approx(
         entropy(joint.sum(axis=0) / joint.sum())
     )
     assert 0.0 <= mutual_information(frames, POSE).mi[0] < entropy(joint.sum(axis=0) / joint.sum())
 
 
-def test_a_flat_depth_map_tells_nothing() -> None:
+def test_a_flat_depth_map_is_uninformative() -> None:
     frames = frames_of(CAMERAS["pinhole"], (5000,), 8, 8)
     frames.depth_bin[:, :-1] = 3
     assert mutual_information(frames, POSE).mi[0] == pytest.approx(0.0, abs=1e-12)

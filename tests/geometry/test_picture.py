@@ -20,10 +20,10 @@ def test_differences_are_those_of_every_second_row() -> None:
     rows, columns = 5, 4
     height, width = GREY.shape[0] // rows, GREY.shape[1] // columns
     whole = GREY[: rows * height, : columns * width].astype(np.int64)
-    apart = np.zeros(whole.shape, np.int64)
-    apart[:, :-1] += np.abs(np.diff(whole, axis=1))
-    apart[:-1] += np.abs(np.diff(whole, axis=0))
-    blocks = apart.reshape(rows, height, columns, width)[:, ::2]
+    separation = np.zeros(whole.shape, np.int64)
+    separation[:, :-1] += np.abs(np.diff(whole, axis=1))
+    separation[:-1] += np.abs(np.diff(whole, axis=0))
+    blocks = separation.reshape(rows, height, columns, width)[:, ::2]
     np.testing.assert_allclose(neighbour_differences(GREY, rows, columns), blocks.mean(axis=(1, 3)))
 
 

@@ -54,10 +54,10 @@ def cloud(seed: int, points: int, scale_m: float) -> NDArray[np.float32]:
 def test_what_single_precision_is_sure_of_is_right(model: str, scale_m: float) -> None:
     camera = CAMERAS[model]
     xyz = cloud(1, 60_000, scale_m)
-    found, expected = single_precision(camera, POSE, xyz), double_precision(camera, POSE, xyz)
-    sure = found != UNSURE
-    np.testing.assert_array_equal(found[sure], expected[sure])
-    assert (found[sure] >= 0).sum() > 1000
+    result, expected = single_precision(camera, POSE, xyz), double_precision(camera, POSE, xyz)
+    sure = result != UNSURE
+    np.testing.assert_array_equal(result[sure], expected[sure])
+    assert (result[sure] >= 0).sum() > 1000
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -68,12 +68,12 @@ def test_it_is_sure_of_nearly_everything(model: str) -> None:
 @pytest.mark.parametrize("model", MODELS)
 def test_double_precision_settles_the_rest(model: str) -> None:
     camera, xyz = CAMERAS[model], cloud(3, 2000, 5.0)
-    found = [exact_pixel(camera, POSE, float(x), float(y), float(z)) for x, y, z in xyz.T]
-    np.testing.assert_array_equal(found, double_precision(camera, POSE, xyz))
+    result = [exact_pixel(camera, POSE, float(x), float(y), float(z)) for x, y, z in xyz.T]
+    np.testing.assert_array_equal(result, double_precision(camera, POSE, xyz))
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_points_laid_on_the_borders_of_pixels_are_left_open(model: str) -> None:
+def test_points_projected_onto_the_borders_of_pixels_are_left_open(model: str) -> None:
     """Points whose projection is a border to the last bit: no answer of single precision would be more than a guess."""
     camera = CAMERAS[model]
     border = np.stack(np.meshgrid(np.arange(100, 500, 7) + 0.5, np.arange(100, 400, 7.0)), axis=-1).reshape(-1, 2)
@@ -83,23 +83,23 @@ def test_points_laid_on_the_borders_of_pixels_are_left_open(model: str) -> None:
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 3e38, 2e6])
-def test_what_is_no_number_or_too_far_is_left_open_or_outside(bad: float) -> None:
+def test_what_is_no_number_or_too_far_is_left_open_or_beyond(bad: float) -> None:
     for camera in CAMERAS.values():
         for axis in range(3):
             xyz = np.full((3, 40), 1.0, np.float32)
             xyz[axis] = bad
-            found, expected = single_precision(camera, POSE, xyz), double_precision(camera, POSE, xyz)
-            assert ((found == UNSURE) | (found == expected)).all()
+            result, expected = single_precision(camera, POSE, xyz), double_precision(camera, POSE, xyz)
+            assert ((result == UNSURE) | (result == expected)).all()
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_the_optical_axis_has_a_pixel_in_single_precision_too(model: str) -> None:
     camera = CAMERAS[model]
     axis = np.array([[0.0, 1e-21, -1e-30, 0.0], [0.0, 1e-22, 1e-25, 0.0], [5.0, 2.0, 7.0, -3.0]], np.float32)
-    found, expected = single_precision(camera, np.eye(4), axis), double_precision(camera, np.eye(4), axis)
+    result, expected = single_precision(camera, np.eye(4), axis), double_precision(camera, np.eye(4), axis)
     assert expected.max() >= 0
-    np.testing.assert_array_equal(found[:3], expected[:3])
-    assert found[3] in (expected[3], UNSURE)
+    np.testing.assert_array_equal(result[:3], expected[:3])
+    assert result[3] in (expected[3], UNSURE)
 
 
 def test_points_nearer_than_the_shift_are_left_open() -> None:
@@ -111,8 +111,8 @@ def test_points_nearer_than_the_shift_are_left_open() -> None:
 def test_an_image_of_too_many_pixels_to_number_is_left_to_double_precision() -> None:
     camera = build("pinhole", **(SENSOR | {"width": 5000, "height": 4000, "cx": 2500.0, "cy": 2000.0, "fx": 3000.0}))
     in_view = np.abs(cloud(4, 1000, 1.0)) + np.float32(0.5)
-    found, expected = single_precision(camera, np.eye(4), in_view), double_precision(camera, np.eye(4), in_view)
-    assert (found[expected >= 0] == UNSURE).all()
+    result, expected = single_precision(camera, np.eye(4), in_view), double_precision(camera, np.eye(4), in_view)
+    assert (result[expected >= 0] == UNSURE).all()
 
 
 COMPILES_OR_LOADS = """

@@ -94,8 +94,8 @@ def test_difference_is_the_perturbation_on_the_left(a: Array, b: Array) -> None:
     nominal = se3.exp(a)
     moved = se3.perturb(nominal, b)
     np.testing.assert_allclose(moved, se3.perturbation(b) @ nominal, rtol=0, atol=1e-11)
-    found = se3.difference(moved, nominal)
-    np.testing.assert_allclose(se3.perturb(nominal, found), moved, rtol=0, atol=1e-11)
+    detected = se3.difference(moved, nominal)
+    np.testing.assert_allclose(se3.perturb(nominal, detected), moved, rtol=0, atol=1e-11)
 
 
 @given(twists())

@@ -10,10 +10,10 @@ BEAMS = 16
 
 @pytest.mark.parametrize(("count", "at_most"), [(0, 5), (1, 1), (7, 7), (7, 100), (1000, 1), (30_000, 3_000), (9, 0)])
 def test_so_many_are_left_each_once_and_in_order(count: int, at_most: int) -> None:
-    chosen = thinned(count, at_most)
-    assert len(chosen) == min(count, at_most)
-    assert (np.diff(chosen) > 0).all()
-    assert ((chosen >= 0) & (chosen < count)).all()
+    selected = thinned(count, at_most)
+    assert len(selected) == min(count, at_most)
+    assert (np.diff(selected) > 0).all()
+    assert ((selected >= 0) & (selected < count)).all()
 
 
 def test_all_are_left_where_there_are_no_more() -> None:

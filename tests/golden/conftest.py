@@ -12,10 +12,10 @@ from golden.reference import IDENTITY, identity, is_identical, write
 @pytest.fixture(scope="session")
 def writes(request: pytest.FixtureRequest) -> bool:
     """Whether today's decisions replace the golden ones."""
-    asked: bool = request.config.getoption("--write-golden")
-    if asked:
+    requested: bool = request.config.getoption("--write-golden")
+    if requested:
         write(IDENTITY, identity())
-    return asked
+    return requested
 
 
 @pytest.fixture(autouse=True)

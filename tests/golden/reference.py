@@ -158,9 +158,9 @@ def check_lines(path: Path, lines: Sequence[Any], tolerance: Tolerance) -> None:
     """Compares a stream with the golden one."""
     head, *golden = (json.loads(line) for line in path.read_text(encoding="utf-8").splitlines())
     now = json.loads(json.dumps([rounded(plain(line)) for line in lines]))
-    found = [f"{len(golden)} lines were written, now {len(now)}"] if len(golden) != len(now) else []
+    result = [f"{len(golden)} lines were written, now {len(now)}"] if len(golden) != len(now) else []
     for number, (before, after) in enumerate(zip(golden, now, strict=False), start=2):
-        found += differences(before, after, tolerance, f"{path.name}:{number} ")
-    assert not found, "\n".join(found[:20])
+        result += differences(before, after, tolerance, f"{path.name}:{number} ")
+    assert not result, "\n".join(result[:20])
     if is_identical():
         assert head["sha256"] == sha256(canonical(list(lines))), f"{path.name}: differs in the last digits or in a text"

@@ -67,15 +67,15 @@ def values(folder: Path) -> dict[str, Any]:
     """What is read of a state directory, in readable form."""
     expected = read(EXPECTED)
     config = Config.model_validate(expected["nominal"])
-    found = DiscoveryStore(folder).load(config)
+    result = DiscoveryStore(folder).load(config)
     baselines = load_baselines(folder / BASELINES)
     rig = RigStore(folder / RIG_FOLDER)
     recalled = rig.restored(RigDrive(_rig_of(folder)).state)
     return {
         "state": read_state.read(folder, expected),
         "history": {pair: _history(folder, pair) for pair in expected["pairs"]},
-        "nominal": {name: one.pair.model_dump(mode="json") for name, one in found.items()},
-        "origins": {name: dict(one.origins) for name, one in found.items()},
+        "nominal": {name: one.pair.model_dump(mode="json") for name, one in result.items()},
+        "origins": {name: dict(one.origins) for name, one in result.items()},
         "baselines": {name: baseline_hash(one) for name, one in baselines.items()},
         "rig": {"damage": plain(rig.damage), "event": plain(recalled.event), "before": plain(recalled.before)},
         "poses": {name: plain(one.pose) for name, one in sorted(recalled.believed.histories.items())},

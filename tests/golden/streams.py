@@ -15,7 +15,7 @@ from coec.calibration.rig.rig_estimator import rig_alarms
 from coec.calibration.types import Matrix4
 from golden.reference import plain
 from service import test_pair_disturbed as pair_drive
-from service.engine.test_lidar_pairs import KNOCKED_S, knocked
+from service.engine.test_lidar_pairs import DISPLACED_S, displaced
 from support.rigs import POSES, LidarBench, RigDrive, moved_poses
 from support.vehicles import BEGIN_S, DRIVE_END_S, OracleWorker, PairBench
 
@@ -80,7 +80,7 @@ def of_pair(watched: pair_drive.Watched) -> tuple[list[dict[str, Any]], list[dic
         *evidence(watched.bench),
         *_windows(watched.windows),
         {"losses": sorted([*reason, count] for reason, count in watched.bench.losses.items())},
-        {"states": watched.told["states"], "unpaired": plain(watched.told["unpaired"])},
+        {"states": watched.reported["states"], "unpaired": plain(watched.reported["unpaired"])},
     ]
     return states, decided
 
@@ -113,9 +113,9 @@ def driven(folder: Path, apply: str) -> list[dict[str, Any]]:
 
 def two_lidars(folder: Path, seed: int | None) -> list[dict[str, Any]]:
     """One of two LiDARs is knocked: what is served of the rig, every five seconds in short and at the end in full."""
-    bench = LidarBench(folder, knocked("bumper"), seed=seed, lidars=LIDARS)
+    bench = LidarBench(folder, displaced("bumper"), seed=seed, lidars=LIDARS)
     lines: list[dict[str, Any]] = []
-    for at_s in range(0, int(KNOCKED_S) + 60, 5):
+    for at_s in range(0, int(DISPLACED_S) + 60, 5):
         bench.drive(float(at_s), at_s + 5.0)
         reply = bench.reply.model_dump(mode="json")
         short = {name: [sensor["state"], sensor["probability"]] for name, sensor in _by_name(reply["sensors"])}
@@ -124,15 +124,15 @@ def two_lidars(folder: Path, seed: int | None) -> list[dict[str, Any]]:
             for name, one in _by_name(reply["lidars"])
         }  # fmt: skip
         lines.append({"at_s": at_s + 5, "sensors": short, "lidars": between})
-    looks = sorted([*look] for look in bench.worker.stamps)
-    return [*lines, {"reply": bench.reply.model_dump(mode="json")}, {"looks": looks}]
+    observations = sorted([*observation] for observation in bench.worker.stamps)
+    return [*lines, {"reply": bench.reply.model_dump(mode="json")}, {"looks": observations}]
 
 
 def _by_name(parts: list[dict[str, Any]]) -> list[tuple[str, dict[str, Any]]]:
     return [(part["name"], part) for part in parts]
 
 
-def rig_of_two_lidars(knocked_lidar: str) -> list[dict[str, Any]]:
+def rig_of_two_lidars(displaced_lidar: str) -> list[dict[str, Any]]:
     """Three cameras and two LiDARs, one of which is knocked, named, and put right in all of its pairs at once."""
     drive = RigDrive(RIG)
     lines: list[dict[str, Any]] = []
@@ -156,12 +156,12 @@ def rig_of_two_lidars(knocked_lidar: str) -> list[dict[str, Any]]:
 
     turn(POSES, 3)
     turn(POSES, 3)
-    poses, knocked_s = moved_poses(knocked_lidar), drive.at_s
+    poses, displaced_s = moved_poses(displaced_lidar), drive.at_s
     turn(poses, 3)
     turn(poses, 3)
     for edge in RIG.edges:
-        if knocked_lidar in (edge.a, edge.b) and edge.name != EDGE:
-            drive.add_window(edge.name, poses, knocked_s + 1.0)
+        if displaced_lidar in (edge.a, edge.b) and edge.name != EDGE:
+            drive.add_window(edge.name, poses, displaced_s + 1.0)
             note()
     turn(poses, 3)
     return lines

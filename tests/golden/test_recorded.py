@@ -30,9 +30,9 @@ def decided(name: str, capsys: pytest.CaptureFixture[str]) -> tuple[int, dict[st
     capsys.readouterr()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["coec", "replay", str(path_of(name)), "--json"])
-        with pytest.raises(SystemExit) as ended:
+        with pytest.raises(SystemExit) as finished:
             runpy.run_module("coec", run_name="__main__")
-    return int(ended.value.code or 0), json.loads(capsys.readouterr().out)
+    return int(finished.value.code or 0), json.loads(capsys.readouterr().out)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -63,15 +63,15 @@ def same(name: str, before: bytes, after: bytes, *, exact: bool) -> None:
         assert after == before, name
         return
     for old, new in zip(before.splitlines(), after.splitlines(), strict=True):
-        found = differences(documents(old.decode()), documents(new.decode()), Tolerance(1e-6, 1e-9))
-        assert all("sha256" in line or "checksum" in line or "hash" in line for line in found), (name, found)
+        result = differences(documents(old.decode()), documents(new.decode()), Tolerance(1e-6, 1e-9))
+        assert all("sha256" in line or "checksum" in line or "hash" in line for line in result), (name, result)
 
 
 def documents(line: str) -> list[Any]:
     """The JSON objects in a line; books have a checksum before them."""
-    decoder, found, at = json.JSONDecoder(), [], line.find("{")
+    decoder, result, at = json.JSONDecoder(), [], line.find("{")
     while at >= 0:
         one, end = decoder.raw_decode(line, at)
-        found.append(one)
+        result.append(one)
         at = line.find("{", end)
-    return found
+    return result

@@ -107,8 +107,8 @@ class Windows:
     def decide(self, case: Case) -> dict[str, Any]:
         """What is stored of a case: hash of the canonical bytes of its result, of each field, and values."""
         result = self.of(case.drive).calibrate(**{"depth": "stereo", **case.options})
-        beside = [one for one in (result.camera_fit, result.time_offset) if one is not None]
-        return stored(result.to_json()) | ({"beside": rounded(plain(beside))} if beside else {})
+        neighbour = [one for one in (result.camera_fit, result.time_offset) if one is not None]
+        return stored(result.to_json()) | ({"beside": rounded(plain(neighbour))} if neighbour else {})
 
 
 def fields_that_differ(golden: dict[str, Any], now: dict[str, Any]) -> list[str]:

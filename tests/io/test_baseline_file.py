@@ -91,7 +91,7 @@ def test_a_matrix_that_is_not_rigid_is_refused() -> None:
     "a forged baseline with the right checksum", "it is refused where its form is not what the monitor compares"
 )
 @pytest.mark.parametrize(("part", "short"), [("gradient", [[1.0], []]), ("bands", [1.0]), ("sectors", [])])
-def test_a_scene_of_other_parts_than_the_monitor_looks_at_is_refused(part: str, short: object) -> None:
+def test_a_scene_of_other_parts_than_the_monitor_checks_is_refused(part: str, short: object) -> None:
     document = baseline_to_json(a_baseline())
     document["scene"][part] = short
     with pytest.raises(StateError, match=part):
@@ -119,7 +119,7 @@ class TestOfModel:
     def test_there_is_none_where_none_is_named(self, tmp_path: Path) -> None:
         assert baseline_of_rig(self.rig, StateConfig(directory=tmp_path)) is None
 
-    def test_a_model_that_knows_nothing_of_the_pair_is_told(self, tmp_path: Path) -> None:
+    def test_a_model_that_knows_nothing_of_the_pair_is_reported(self, tmp_path: Path) -> None:
         save_baseline(tmp_path / "model.json", replace(a_baseline(), pair="rear"))
         with pytest.raises(StateError, match=r"state\.model.*no baseline of the pair front"):
             baseline_of_rig(self.rig, StateConfig(directory=tmp_path, model=tmp_path / "model.json"))

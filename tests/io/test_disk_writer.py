@@ -36,25 +36,25 @@ class Book:
 
 @contextmanager
 def writing(folder: Path) -> Iterator[DiskWriter]:
-    scribe = DiskWriter(folder)
-    scribe.thread.start()
+    writer_again = DiskWriter(folder)
+    writer_again.thread.start()
     try:
-        yield scribe
+        yield writer_again
     finally:
-        scribe.request_stop()
-        assert scribe.thread.join(20.0)
-        assert scribe.thread.failure is None
+        writer_again.request_stop()
+        assert writer_again.thread.join(20.0)
+        assert writer_again.thread.failure is None
 
 
 def test_what_is_put_down_is_written_soon_and_the_last_before_the_end(tmp_path: Path) -> None:
     book = Book()
-    with writing(tmp_path) as scribe:
-        assert scribe.has_written()
-        scribe.write(book)
-        wait_until(scribe.has_written, "the book")
+    with writing(tmp_path) as writer_again:
+        assert writer_again.has_written()
+        writer_again.write(book)
+        wait_until(writer_again.has_written, "the book")
         assert book.written == 1
-        assert scribe.problem is None
-        scribe.write(book)
+        assert writer_again.problem is None
+        writer_again.write(book)
     assert book.written == 2
 
 
@@ -62,17 +62,17 @@ def test_a_disk_that_refuses_is_named_and_tried_again(tmp_path: Path, monkeypatc
     monkeypatch.setattr(scribe_module, "RETRY_S", 0.01)
     broken, well = Book(), Book()
     broken.refuses = True
-    with writing(tmp_path) as scribe:
-        scribe.write(broken, well)
-        wait_until(lambda: scribe.problem is not None, "the trouble")
-        assert scribe.problem is not None
-        assert (scribe.problem.code, "No space" in scribe.problem.text) == ("disk_failing", True)
-        assert not scribe.has_written()
+    with writing(tmp_path) as writer_again:
+        writer_again.write(broken, well)
+        wait_until(lambda: writer_again.problem is not None, "the trouble")
+        assert writer_again.problem is not None
+        assert (writer_again.problem.code, "No space" in writer_again.problem.text) == ("disk_failing", True)
+        assert not writer_again.has_written()
         assert well.written == 1, "one book that cannot be written keeps no other waiting"
         broken.refuses = False
-        wait_until(scribe.has_written, "the second attempt")
+        wait_until(writer_again.has_written, "the second attempt")
         assert broken.written == 1
-    assert scribe.problem is None
+    assert writer_again.problem is None
 
 
 def test_nobody_waits_for_a_disk_that_hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,39 +80,39 @@ def test_nobody_waits_for_a_disk_that_hangs(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(scribe_module, "PATIENCE_S", 0.0)
     book = Book()
     book.let.clear()
-    with writing(tmp_path) as scribe:
-        scribe.write(book)
-        wait_until(lambda: scribe.problem is not None, "the trouble")
-        assert scribe.problem is not None
-        assert scribe.problem.code == "disk_slow"
-        assert not scribe.has_written()
-        scribe.write(book)
+    with writing(tmp_path) as writer_again:
+        writer_again.write(book)
+        wait_until(lambda: writer_again.problem is not None, "the trouble")
+        assert writer_again.problem is not None
+        assert writer_again.problem.code == "disk_slow"
+        assert not writer_again.has_written()
+        writer_again.write(book)
         book.let.set()
-        wait_until(scribe.has_written, "both")
+        wait_until(writer_again.has_written, "both")
     assert book.written == 2
 
 
 @pytest.mark.parametrize(("code", "changed"), [("disk_full", {"f_bavail": 0}), ("disk_read_only", {"f_flag": 1})])
-def test_a_disk_without_room_is_told_before_anything_is_refused(
+def test_a_disk_without_room_is_reported_before_anything_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, changed: dict[str, int]
 ) -> None:
     real = os.statvfs(tmp_path)
     names = [name for name in dir(real) if name.startswith("f_")]
 
-    class Found:
+    class ClosingResult:
         pass
 
-    found = Found()
+    result = ClosingResult()
     for name in names:
-        setattr(found, name, changed.get(name, getattr(real, name)))
-    monkeypatch.setattr(os, "statvfs", lambda _: found)
-    scribe = DiskWriter(tmp_path)
-    scribe.check_folder()
-    assert scribe.problem is not None
-    assert scribe.problem.code == code
+        setattr(result, name, changed.get(name, getattr(real, name)))
+    monkeypatch.setattr(os, "statvfs", lambda _: result)
+    writer_again = DiskWriter(tmp_path)
+    writer_again.check_folder()
+    assert writer_again.problem is not None
+    assert writer_again.problem.code == code
     monkeypatch.undo()
-    scribe.check_folder()
-    assert scribe.problem is None
+    writer_again.check_folder()
+    assert writer_again.problem is None
 
 
 # --- ledgers ----------------------------------------------------------------------------------------------------------
@@ -125,21 +125,21 @@ def ledger(path: Path, limit: int = 5) -> AppendLog[bytes]:
     return made
 
 
-def test_items_are_kept_at_once_and_on_the_disk_when_they_are_flushed(tmp_path: Path) -> None:
-    kept = ledger(tmp_path / "l")
+def test_items_are_retained_at_once_and_on_the_disk_when_they_are_flushed(tmp_path: Path) -> None:
+    retained = ledger(tmp_path / "l")
     for number in range(3):
-        kept.add(lambda last, number=number: b"%d after %s" % (number, last or b"nothing"))  # type: ignore[misc]
-    assert kept.items()[0] == b"0 after nothing"
-    assert kept.items()[1].startswith(b"1 after 0 ")
-    assert (kept.on_disk(), kept.durable, ledger(tmp_path / "l").items()) == ((), None, ())
-    kept.flush()
-    assert kept.on_disk() == kept.items() == ledger(tmp_path / "l").items()
-    assert kept.durable == kept.items()[-1]
+        retained.add(lambda last, number=number: b"%d after %s" % (number, last or b"nothing"))  # type: ignore[misc]
+    assert retained.items()[0] == b"0 after nothing"
+    assert retained.items()[1].startswith(b"1 after 0 ")
+    assert (retained.on_disk(), retained.durable, ledger(tmp_path / "l").items()) == ((), None, ())
+    retained.flush()
+    assert retained.on_disk() == retained.items() == ledger(tmp_path / "l").items()
+    assert retained.durable == retained.items()[-1]
 
 
 def test_what_is_added_while_the_disk_writes_comes_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever writes has begun when another item comes: also where the whole file is written anew."""
-    kept = ledger(tmp_path / "l", limit=3)
+    retained = ledger(tmp_path / "l", limit=3)
     real = os.fsync
     number = 0
 
@@ -147,35 +147,35 @@ def test_what_is_added_while_the_disk_writes_comes_once(tmp_path: Path, monkeypa
         nonlocal number
         real(descriptor)
         number += 1
-        kept.add(lambda _: b"%d" % number)
+        retained.add(lambda _: b"%d" % number)
 
     monkeypatch.setattr(os, "fsync", adding)
-    kept.add(lambda _: b"0")
+    retained.add(lambda _: b"0")
     for _ in range(12):
-        kept.flush()
+        retained.flush()
     monkeypatch.undo()
-    kept.flush()
-    assert ledger(tmp_path / "l", limit=3).items() == kept.items() == kept.on_disk()
+    retained.flush()
+    assert ledger(tmp_path / "l", limit=3).items() == retained.items() == retained.on_disk()
     lines = (tmp_path / "l").read_bytes().split()
     assert lines == sorted(set(lines), key=int)
 
 
 def test_a_disk_that_refuses_for_long_does_not_fill_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     disk = Disk(tmp_path, monkeypatch)
-    kept = ledger(tmp_path / "l", limit=5)
+    retained = ledger(tmp_path / "l", limit=5)
     disk.refuses = EVERY_OPERATION
     for number in range(100):
-        kept.add(lambda _, number=number: b"%d" % number)  # type: ignore[misc]
+        retained.add(lambda _, number=number: b"%d" % number)  # type: ignore[misc]
         with pytest.raises(OSError, match="No space"):
-            kept.flush()
-    assert len(kept.items()) == 5
+            retained.flush()
+    assert len(retained.items()) == 5
     disk.refuses = ()
-    kept.flush()
-    assert ledger(tmp_path / "l").items() == kept.items() == tuple(b"%d" % number for number in range(95, 100))
+    retained.flush()
+    assert ledger(tmp_path / "l").items() == retained.items() == tuple(b"%d" % number for number in range(95, 100))
 
 
 def test_a_hanging_disk_keeps_no_reader_waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    kept = ledger(tmp_path / "l")
+    retained = ledger(tmp_path / "l")
     hangs, let = threading.Event(), threading.Event()
     real = os.fsync
 
@@ -185,12 +185,12 @@ def test_a_hanging_disk_keeps_no_reader_waiting(tmp_path: Path, monkeypatch: pyt
         real(descriptor)
 
     monkeypatch.setattr(os, "fsync", hanging)
-    kept.add(lambda _: b"a")
-    writer = threading.Thread(target=kept.flush)
+    retained.add(lambda _: b"a")
+    writer = threading.Thread(target=retained.flush)
     writer.start()
     assert hangs.wait(20.0)
-    kept.add(lambda _: b"b")
-    assert (kept.items(), kept.on_disk()) == ((b"a", b"b"), ())
+    retained.add(lambda _: b"b")
+    assert (retained.items(), retained.on_disk()) == ((b"a", b"b"), ())
     let.set()
     writer.join(20.0)
-    assert kept.on_disk() == (b"a",)
+    assert retained.on_disk() == (b"a",)

@@ -253,7 +253,7 @@ def test_a_velocity_that_is_none_is_refused(value: object) -> None:
     assert reason_of(decode_ego, EGO | {"linear_mps": [0.0, value, 0.0]}) == "motion_invalid"
 
 
-def test_a_velocity_that_is_not_known_is_said_to_be_so() -> None:
+def test_a_velocity_that_is_not_known_is_reported_to_be_so() -> None:
     turning = EgoMotion(5, "imu", None, (0.0, 0.0, 0.5), 7)
     assert decode_ego(encode_ego(turning), LIMITS) == turning
     silent = {name: value for name, value in EGO.items() if name != "linear_mps"}
@@ -303,7 +303,7 @@ MEGABYTE = 2**20
     ids=lambda payload: f"{payload[:8].hex()}-{len(payload)}",
 )
 @pytest.mark.parametrize(("decode", "_fields"), DECODERS)
-def test_a_bomb_is_refused_without_the_memory_it_asks_for(
+def test_a_bomb_is_refused_without_the_memory_it_requests(
     decode: Callable[..., object], _fields: object, payload: bytes
 ) -> None:
     tracemalloc.start()
@@ -314,7 +314,7 @@ def test_a_bomb_is_refused_without_the_memory_it_asks_for(
         tracemalloc.stop()
 
 
-def test_a_message_beyond_the_limit_is_not_even_looked_at() -> None:
+def test_a_message_beyond_the_limit_is_not_even_checked() -> None:
     assert reason_of(decode_lidar, bytes(2**16 + 1), LimitsConfig(max_message_bytes=2**16)) == "message_too_large"
 
 

@@ -45,7 +45,7 @@ def test_a_configuration_becomes_a_rig(tmp_path: Path) -> None:
     assert np.array_equal(rig.mask, mask > 0)
 
 
-def test_the_frame_of_the_clouds_is_told_where_it_is_another() -> None:
+def test_the_frame_of_the_clouds_is_reported_where_it_is_another() -> None:
     assert rig_of(a_config()).cloud is None
     rig = rig_of(a_config(lidar=LidarConfig(key="k", cloud_frame_id="base_link", T_cloud_lidar=T)))
     assert rig.cloud is not None

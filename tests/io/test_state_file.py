@@ -41,7 +41,7 @@ def test_what_was_saved_last_is_loaded(tmp_path: Path) -> None:
 
 
 @pytest.mark.fault("any bit of the state file flipped", "it is found, and the previous good copy is served")
-def test_any_flipped_bit_is_found_and_the_previous_copy_served(tmp_path: Path) -> None:
+def test_any_flipped_bit_is_detected_and_the_previous_copy_served(tmp_path: Path) -> None:
     path = saved(tmp_path, FIRST, SECOND)
     good = path.read_bytes()
     for index in range(len(good)):
@@ -55,7 +55,7 @@ def test_any_flipped_bit_is_found_and_the_previous_copy_served(tmp_path: Path) -
 
 
 @pytest.mark.fault("a state file cut off at any byte", "it is found; nothing is served without a good copy")
-def test_any_cut_is_found_and_nothing_is_served_without_a_good_copy(tmp_path: Path) -> None:
+def test_any_cut_is_detected_and_nothing_is_served_without_a_good_copy(tmp_path: Path) -> None:
     path = saved(tmp_path, FIRST)
     good = path.read_bytes()
     for length in range(len(good)):
@@ -90,7 +90,7 @@ def by_newer_service(path: Path, body: dict[str, object], checksum: str = "") ->
 @pytest.mark.fault(
     "a state file of a newer schema version", "it is read if its checksum is right, and kept aside, not overwritten"
 )
-def test_a_file_of_a_newer_schema_version_is_read_and_kept_aside(tmp_path: Path) -> None:
+def test_a_file_of_a_newer_schema_version_is_read_and_quarantined(tmp_path: Path) -> None:
     path = saved(tmp_path, FIRST)
     newer = by_newer_service(path, SECOND)
     file = StateFile(path)
@@ -127,20 +127,20 @@ def test_a_copy_that_is_distrusted_twice_does_not_cost_the_other_copy(tmp_path: 
     assert (tmp_path / "state.json.broken").read_bytes() == unusable
 
 
-def test_what_is_kept_aside_is_bounded_and_the_first_ones_stay(tmp_path: Path) -> None:
+def test_what_is_quarantined_is_bounded_and_the_first_ones_stay(tmp_path: Path) -> None:
     path = tmp_path / "state.json"
     for number in range(2 * MAX_QUARANTINED):
         path.write_bytes(b"junk %d" % number)
         file = StateFile(path)
         assert file.load().damage
         file.save(FIRST)
-    aside = {entry.name: entry.read_bytes() for entry in tmp_path.glob("*.broken*")}
-    assert len(aside) == MAX_QUARANTINED + 1
-    assert aside["state.json.broken"] == b"junk 0"
-    assert b"junk %d" % (2 * MAX_QUARANTINED - 1) in aside.values()
+    offset = {entry.name: entry.read_bytes() for entry in tmp_path.glob("*.broken*")}
+    assert len(offset) == MAX_QUARANTINED + 1
+    assert offset["state.json.broken"] == b"junk 0"
+    assert b"junk %d" % (2 * MAX_QUARANTINED - 1) in offset.values()
 
 
-def test_a_save_waits_until_what_cannot_be_used_is_kept_aside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_save_waits_until_what_cannot_be_used_is_quarantined(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     disk = Disk(tmp_path, monkeypatch)
     path = saved(tmp_path, FIRST)
     path.write_bytes(b"junk")

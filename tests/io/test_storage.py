@@ -32,7 +32,7 @@ def root(tmp_path: Path) -> Path:
 # --- replacement ----------------------------------------------------------------------------------------------------
 
 
-def test_a_file_is_replaced_whole_and_its_previous_copy_kept(root: Path) -> None:
+def test_a_file_is_replaced_whole_and_its_previous_copy_retained(root: Path) -> None:
     path, previous = root / "f", root / "f.previous"
     storage.replace(path, b"first", previous)
     storage.replace(path, b"second", previous)
@@ -132,9 +132,9 @@ def test_a_file_that_has_become_too_long_is_written_anew(root: Path) -> None:
     log = log_of(root / "log", lines, limit=3)
     for number in range(20):
         write(log, lines, b"%d" % number)
-        found = log_of(root / "log", []).load()
-        assert len(found) <= 6
-        assert found[-3:] == lines[-3:]
+        result = log_of(root / "log", []).load()
+        assert len(result) <= 6
+        assert result[-3:] == lines[-3:]
 
 
 @pytest.mark.parametrize("harm", [Path.unlink, lambda path: path.write_bytes(b"on")], ids=["removed", "cut"])
@@ -229,9 +229,9 @@ def test_whatever_is_refused_no_line_is_lost_torn_or_out_of_order(
                 with suppress(OSError):
                     write(log, lines, b"%d" % number)
                     safe = number
-                found = [int(line) for line in log_of(root / "log", []).load()]
-                assert found == list(range(found[0], found[-1] + 1)) if found else safe == -1
-                assert not found or (found[-1] >= safe and found[0] <= max(0, found[-1] - 2))
+                result = [int(line) for line in log_of(root / "log", []).load()]
+                assert result == list(range(result[0], result[-1] + 1)) if result else safe == -1
+                assert not result or (result[-1] >= safe and result[0] <= max(0, result[-1] - 2))
             disk.refuses = ()
             log.flush()
             assert log_of(root / "log", []).load()[-1] == b"9"

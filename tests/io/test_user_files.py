@@ -14,10 +14,10 @@ from coec.io import user_files
 
 
 def test_a_folder_that_was_tried_is_as_it_was(tmp_path: Path) -> None:
-    kept = tmp_path / "kept"
-    kept.mkdir()
-    (kept / "note").write_text("mine")
-    for folder in (kept, tmp_path / "one" / "two", tmp_path):
+    retained = tmp_path / "kept"
+    retained.mkdir()
+    (retained / "note").write_text("mine")
+    for folder in (retained, tmp_path / "one" / "two", tmp_path):
         user_files.try_folder(folder)
     user_files.try_file(tmp_path / "three" / "rig.json")
     assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["kept", "kept/note"]

@@ -9,11 +9,11 @@ from importlib import metadata
 
 import pytest
 
-from cli.conftest import Coec, coec, drawn_once  # noqa: F401  fixtures
+from cli.conftest import Coec, coec, rendered_once  # noqa: F401  fixtures
 from coec_lab.simulation import surroundings
 from coec_lab.simulation.passages import Passages
 from coec_lab.simulation.road import Road
-from coec_lab.simulation.street import Stretch, Style
+from coec_lab.simulation.street import Stretch, Style, build_stretch
 from conftest import REPOSITORY
 
 PROJECT = tomllib.loads((REPOSITORY / "service" / "coec_lab" / "pyproject.toml").read_text())["project"]
@@ -39,12 +39,11 @@ def streets() -> Iterator[Streets]:
     """Drives of one street share its stretches. To build them takes most of the time of a short drive; `test_scene.py`
     holds that a stretch depends on nothing else."""
     built: Streets = {}
-    build = surroundings.build_stretch
 
     def built_once(seed: int, index: int, road: Road, style: Style, passages: Passages) -> Stretch:
         key = (seed, index, road.begin_m, hashlib.sha256(road.table.tobytes()).digest(), passages)
         if key not in built:
-            built[key] = build(seed, index, road, style, passages)
+            built[key] = build_stretch(seed, index, road, style, passages)
         return built[key]
 
     with pytest.MonkeyPatch.context() as patch:

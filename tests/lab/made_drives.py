@@ -21,7 +21,7 @@ def died(number: int) -> int:
     return number
 
 
-def begun(folder: Path) -> None:
+def started(folder: Path) -> None:
     """A drive that goes on for ever, once it has left the number of its process."""
     (folder / str(os.getpid())).touch()
     signal.pause()

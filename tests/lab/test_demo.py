@@ -40,9 +40,9 @@ START = Moment(
 HEALTHY = replace(
     START, drive_s=28.0, health="healthy", provenance="estimated", status="accepted", window_id="w-1", error_deg=0.04
 )
-KNOCKED = replace(HEALTHY, drive_s=36.2, error_deg=3.01)
-SUSPECT = replace(KNOCKED, drive_s=46.0, health="suspect")
-ALARM = replace(KNOCKED, drive_s=51.0, health="miscalibrated")
+DISPLACED = replace(HEALTHY, drive_s=36.2, error_deg=3.01)
+SUSPECT = replace(DISPLACED, drive_s=46.0, health="suspect")
+ALARM = replace(DISPLACED, drive_s=51.0, health="miscalibrated")
 REPAIRED = replace(HEALTHY, drive_s=61.0, window_id="w-2", error_deg=0.06)
 
 
@@ -50,20 +50,20 @@ def outcome(*moments: Moment) -> PairOutcome:
     return outcome_of(moments, KNOCK_S, MAX_ERROR_DEG)
 
 
-def test_a_story_that_came_true() -> None:
-    result = outcome(START, HEALTHY, KNOCKED, SUSPECT, ALARM, REPAIRED)
+def test_a_story_that_arrived_true() -> None:
+    result = outcome(START, HEALTHY, DISPLACED, SUSPECT, ALARM, REPAIRED)
     assert result.passed
     assert (result.alarm_s, result.repaired_s, result.false_alarm_s) == (51.0, 61.0, None)
     assert (result.error_before_deg, result.error_after_deg) == (3.01, 0.06)
 
 
 def test_an_alarm_at_the_calibration_of_the_workshop_is_no_false_one() -> None:
-    result = outcome(START, replace(START, drive_s=11.0, health="miscalibrated"), HEALTHY, KNOCKED, ALARM, REPAIRED)
+    result = outcome(START, replace(START, drive_s=11.0, health="miscalibrated"), HEALTHY, DISPLACED, ALARM, REPAIRED)
     assert result.passed
 
 
-def test_an_alarm_that_came_and_went_between_two_looks_is_in_the_story() -> None:
-    seen = [START, HEALTHY, KNOCKED, SUSPECT, REPAIRED]
+def test_an_alarm_that_arrived_and_went_between_two_observations_is_in_the_story() -> None:
+    seen = [START, HEALTHY, DISPLACED, SUSPECT, REPAIRED]
     result = outcome(*with_alarm(seen, 50.0))
     assert result.passed
     assert (result.alarm_s, result.repaired_s, result.error_before_deg) == (50.0, 61.0, 3.01)
@@ -72,15 +72,15 @@ def test_an_alarm_that_came_and_went_between_two_looks_is_in_the_story() -> None
 @pytest.mark.parametrize(
     ("moments", "complaint"),
     [
-        ((START, HEALTHY, KNOCKED), "never detected"),
-        ((START, HEALTHY, KNOCKED, SUSPECT, REPAIRED), "never detected"),
-        ((START, HEALTHY, KNOCKED, ALARM), "did not correct"),
-        ((START, HEALTHY, KNOCKED, ALARM, replace(REPAIRED, error_deg=0.31)), "did not correct"),
-        ((START, HEALTHY, KNOCKED, ALARM, REPAIRED, replace(REPAIRED, error_deg=0.31)), "did not correct"),
-        ((START, HEALTHY, KNOCKED, ALARM, replace(REPAIRED, provenance="nominal")), "did not correct"),
-        ((START, HEALTHY, KNOCKED, ALARM, REPAIRED, replace(REPAIRED, health="degraded")), "degraded at the end"),
+        ((START, HEALTHY, DISPLACED), "never detected"),
+        ((START, HEALTHY, DISPLACED, SUSPECT, REPAIRED), "never detected"),
+        ((START, HEALTHY, DISPLACED, ALARM), "did not correct"),
+        ((START, HEALTHY, DISPLACED, ALARM, replace(REPAIRED, error_deg=0.31)), "did not correct"),
+        ((START, HEALTHY, DISPLACED, ALARM, REPAIRED, replace(REPAIRED, error_deg=0.31)), "did not correct"),
+        ((START, HEALTHY, DISPLACED, ALARM, replace(REPAIRED, provenance="nominal")), "did not correct"),
+        ((START, HEALTHY, DISPLACED, ALARM, REPAIRED, replace(REPAIRED, health="degraded")), "degraded at the end"),
         (
-            (START, HEALTHY, replace(ALARM, drive_s=30.0, error_deg=0.04), KNOCKED, ALARM, REPAIRED),
+            (START, HEALTHY, replace(ALARM, drive_s=30.0, error_deg=0.04), DISPLACED, ALARM, REPAIRED),
             "before the displacement",
         ),
     ],
@@ -98,19 +98,19 @@ def frames(count: int) -> Iterator[EgoMotion]:
 
 def test_the_drive_waits_for_the_service() -> None:
     refusals = {3 * NS_PER_S: 2, 5 * NS_PER_S: 1}
-    asked: list[int] = []
+    requested: list[int] = []
 
     def may_pass(stamp_ns: int) -> bool:
-        asked.append(stamp_ns // NS_PER_S)
+        requested.append(stamp_ns // NS_PER_S)
         refusals[stamp_ns] = refusals.get(stamp_ns, 0) - 1
         return refusals[stamp_ns] < 0
 
     sent = [frame.stamp_ns // NS_PER_S for frame in paced(frames(6), may_pass, threading.Event(), rate=1e9)]
     assert sent == [1, 2, 3, 4, 5, 6]
-    assert asked == [1, 2, 3, 3, 3, 4, 5, 5, 6]
+    assert requested == [1, 2, 3, 3, 3, 4, 5, 5, 6]
 
 
-def test_the_drive_ends_when_it_is_told() -> None:
+def test_the_drive_ends_when_it_is_reported() -> None:
     stop = threading.Event()
     stop.set()
     assert len(list(paced(frames(30), lambda _: False, stop, rate=1e-9))) == 30, "no wait is left"
@@ -156,7 +156,7 @@ def test_a_service_rests_that_has_everything_and_no_work(
     assert at_rest(worker, replies.PairStatus(name="sim", camera=camera, held=held), sent=20) is rests
 
 
-def test_a_service_does_not_rest_while_an_answer_is_awaited() -> None:
+def test_a_service_does_not_rest_while_an_answer_is_pending() -> None:
     """A window is with the recorder, say: it waits neither for the worker nor for its turn."""
     pair = replies.PairStatus(name="sim", camera=replies.StreamStatus(received=20), unanswered=1)
     assert not at_rest(replies.WorkerStatus(state="idle"), pair, sent=20)
@@ -171,7 +171,7 @@ def test_the_curve_has_the_height_of_the_error_and_the_colour_of_the_health() ->
 
 
 def test_the_page_needs_no_other_file() -> None:
-    moments = [START, HEALTHY, KNOCKED, ALARM, REPAIRED]
+    moments = [START, HEALTHY, DISPLACED, ALARM, REPAIRED]
     text = document_of(moments)
     assert "src=" not in text
     assert "detected and corrected" in text
@@ -193,17 +193,17 @@ def document_of(moments: Sequence[Moment]) -> str:
 def test_the_summary_says_when_what_happened(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = io.StringIO()
     monkeypatch.setattr("coec.reports.console.out", Console(file=stream, width=140))
-    moments = [START, HEALTHY, KNOCKED, replace(SUSPECT, drive_s=ALARM.drive_s), ALARM, REPAIRED]
+    moments = [START, HEALTHY, DISPLACED, replace(SUSPECT, drive_s=ALARM.drive_s), ALARM, REPAIRED]
     pair_report.show(moments, outcome(*moments), pair_report.WrittenFiles((), None))
-    said = stream.getvalue()
+    reported = stream.getvalue()
     for error in ("0.900°", "0.040°", "3.010°", "0.060°"):
-        assert error in said
-    assert "15 s after it" in said
-    assert "25 s after it" in said
-    (alarm,) = (line for line in said.splitlines() if line.rstrip().endswith("alarm"))
+        assert error in reported
+    assert "15 s after it" in reported
+    assert "25 s after it" in reported
+    (alarm,) = (line for line in reported.splitlines() if line.rstrip().endswith("alarm"))
     assert "miscalibrated" in alarm, "not the line before, of the same second"
     for what in ("displaced", "alarm", "corrected", "accepted"):
-        assert what in said
+        assert what in reported
 
 
 def test_the_service_is_configured_as_on_a_vehicle_but_for_the_haste() -> None:
@@ -221,7 +221,7 @@ def test_the_service_is_configured_as_on_a_vehicle_but_for_the_haste() -> None:
     assert top + height <= drive.rig.camera.height
 
 
-def test_there_is_something_to_look_at_before_the_service_says_anything(tmp_path: Path) -> None:
+def test_there_is_something_to_check_before_the_service_reports_anything(tmp_path: Path) -> None:
     pytest.importorskip("embreex", reason="needs ray casting")
     from coec_lab.simulation.drive import SimulatedDrive
 
@@ -334,16 +334,16 @@ def seen_with(worker: str, t_s: float) -> Snapshot:
     return Snapshot(replace(START, t_s=t_s), status, health, extrinsic)
 
 
-def test_a_first_run_says_that_it_compiles_and_then_tells_the_story(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_first_run_reports_that_it_compiles_and_then_reports_the_story(capsys: pytest.CaptureFixture[str]) -> None:
     watch: Any = SimpleNamespace(series=[])
     screen = Screen()
     for t_s in (3.0, 10.0, 30.0):
         screen.show(watch, seen_with("starting", t_s))
     screen.show(watch, seen_with("idle", 35.0))
-    said = capsys.readouterr().err.splitlines()
-    assert len(said) == 2
-    assert "compiling the kernels, once on this machine" in said[0]
-    assert "0.0 s of driving: unknown, nominal" in said[1]
+    reported = capsys.readouterr().err.splitlines()
+    assert len(reported) == 2
+    assert "compiling the kernels, once on this machine" in reported[0]
+    assert "0.0 s of driving: unknown, nominal" in reported[1]
 
 
 def test_the_live_view_says_why_the_drive_does_not_begin() -> None:

@@ -45,7 +45,7 @@ SENSORS = ("front", "left", "rear", "right", "roof")
 KNOCK_S = SCENARIO.knock_s
 
 
-def told(second: float, *moved: str) -> RigSnapshot:
+def reported(second: float, *moved: str) -> RigSnapshot:
     def sensor(name: str) -> SensorCondition:
         kind = "lidar" if name == "roof" else "camera"
         state = f"{kind}_moved" if name in moved else "calibrated"
@@ -74,10 +74,10 @@ class LazyExecutor(Executor):
     """Works in this process. `asked`: how often it was given something to do."""
 
     def __init__(self) -> None:
-        self.asked = 0
+        self.requested = 0
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        self.asked += 1
+        self.requested += 1
         return LazyResult(lambda: fn(*args, **kwargs))
 
 
@@ -86,38 +86,38 @@ def vehicle_of(executor: Executor, scenario: Scenario) -> RigVehicle:
     return RigVehicle(parallel.FrameRenderers(executor), scenario)
 
 
-QUIET, NAMED = told(KNOCK_S - 9.0), told(KNOCK_S + 14.0, "left")
+QUIET, NAMED = reported(KNOCK_S - 9.0), reported(KNOCK_S + 14.0, "left")
 
 
-def test_the_sensor_that_was_knocked_has_to_be_named_and_to_stay_so() -> None:
-    correct = outcome_of(CAMERA, [QUIET, told(KNOCK_S + 4.0), NAMED, told(KNOCK_S + 20.0, "left")], KNOCK_S)
+def test_the_sensor_that_was_displaced_has_to_be_named_and_to_stay_so() -> None:
+    correct = outcome_of(CAMERA, [QUIET, reported(KNOCK_S + 4.0), NAMED, reported(KNOCK_S + 20.0, "left")], KNOCK_S)
     assert correct == ActOutcome(CAMERA, KNOCK_S + 14.0, ())
     assert correct.passed
     assert not is_over(correct, NAMED, SCENARIO.rest_s)
-    assert is_over(correct, told(KNOCK_S + 14.0 + SCENARIO.rest_s, "left"), SCENARIO.rest_s)
-    assert outcome_of(CAMERA, [QUIET, NAMED, told(KNOCK_S + 20.0)], KNOCK_S).named_s is None
+    assert is_over(correct, reported(KNOCK_S + 14.0 + SCENARIO.rest_s, "left"), SCENARIO.rest_s)
+    assert outcome_of(CAMERA, [QUIET, NAMED, reported(KNOCK_S + 20.0)], KNOCK_S).named_s is None
 
 
 @pytest.mark.parametrize(
-    ("heard", "complaint"),
+    ("received", "complaint"),
     [
         ((QUIET,), "left was displaced, and is not identified"),
-        ((QUIET, told(KNOCK_S + 9.0, "left", "roof")), "left was displaced, and is not identified"),
-        ((QUIET, told(KNOCK_S + 9.0, "left", "roof"), NAMED), "roof was reported as moved, and had not moved"),
-        ((told(KNOCK_S - 1.0, "left"), NAMED), "left was reported as moved, and had not moved"),
+        ((QUIET, reported(KNOCK_S + 9.0, "left", "roof")), "left was displaced, and is not identified"),
+        ((QUIET, reported(KNOCK_S + 9.0, "left", "roof"), NAMED), "roof was reported as moved, and had not moved"),
+        ((reported(KNOCK_S - 1.0, "left"), NAMED), "left was reported as moved, and had not moved"),
     ],
 )
-def test_an_act_that_did_not_come_true(heard: tuple[RigSnapshot, ...], complaint: str) -> None:
-    outcome = outcome_of(CAMERA, heard, KNOCK_S)
+def test_an_act_that_did_not_come_true(received: tuple[RigSnapshot, ...], complaint: str) -> None:
+    outcome = outcome_of(CAMERA, received, KNOCK_S)
     assert not outcome.passed
     assert complaint in " ".join(outcome.failures())
     assert complaint in rig.summary(outcome, SCENARIO)
 
 
-def test_only_what_is_new_is_told(tmp_path: Path) -> None:
-    heard = [QUIET, told(KNOCK_S - 4.0), NAMED, replace(NAMED, second=KNOCK_S + 16.0)]
-    assert rig.changes(heard) == [QUIET, NAMED]
-    performances = [(outcome_of(LIDAR, [QUIET], KNOCK_S), [QUIET]), (outcome_of(CAMERA, heard, KNOCK_S), heard)]
+def test_only_what_is_new_is_reported(tmp_path: Path) -> None:
+    received = [QUIET, reported(KNOCK_S - 4.0), NAMED, replace(NAMED, second=KNOCK_S + 16.0)]
+    assert rig.changes(received) == [QUIET, NAMED]
+    performances = [(outcome_of(LIDAR, [QUIET], KNOCK_S), [QUIET]), (outcome_of(CAMERA, received, KNOCK_S), received)]
     files = rig.write(tmp_path, RigDrive(RigDriveConfig(seconds=1.0, camera="fisheye64")), performances, SCENARIO)
     assert [path.name for path in files] == ["lidar_knocked.png", "camera_knocked.png", "report.html"]
     page = files[-1].read_text()
@@ -142,15 +142,15 @@ def test_acts_share_the_frames_of_what_stands_still() -> None:
             assert (picture is after.pictures[camera]) is not turned
 
 
-def test_frames_are_drawn_ahead_of_the_one_that_is_sent_and_not_to_the_end() -> None:
+def test_frames_are_rendered_ahead_of_the_one_that_is_sent_and_not_to_the_end() -> None:
     drawers = LazyExecutor()
     frames = vehicle_of(drawers, Scenario(camera_px=64, longest_s=20.0)).frames(LIDAR)
-    assert drawers.asked == 5 * (AHEAD - 1), "all but the first, which compiles what the others then find compiled"
+    assert drawers.requested == 5 * (AHEAD - 1), "all but the first, which compiles what the others then find compiled"
     next(frames)
-    assert drawers.asked == 5 * AHEAD
+    assert drawers.requested == 5 * AHEAD
 
 
-def test_what_the_service_says_is_told_as_it_is() -> None:
+def test_what_the_service_reports_is_reported_as_it_is() -> None:
     offset = (0.3, 0.4, None, 0.0, 0.0, None)
     taken = a_health().check
     assert taken is not None
@@ -158,16 +158,18 @@ def test_what_the_service_says_is_told_as_it_is() -> None:
     blind = taken.model_copy(update={"offset": (None,) * 6, "sigma": (None,) * 6})
     sensors_of = {"front": ("front", "roof"), "left": ("left", "roof")}
     reply = moved_lidar_reply()
-    said = snapshot_of(reply, START_NS + 9 * NS_PER_S, ["front", "left"], {"front": check, "left": blind}, sensors_of)
-    assert said.second == 9.0
-    assert said.checked == "front, left"
-    assert said.named == {"roof"}
-    roof = said.sensors["roof"]
+    message = snapshot_of(
+        reply, START_NS + 9 * NS_PER_S, ["front", "left"], {"front": check, "left": blind}, sensors_of
+    )
+    assert message.second == 9.0
+    assert message.checked == "front, left"
+    assert message.named == {"roof"}
+    roof = message.sensors["roof"]
     assert (roof.state, roof.probability, roof.moved_deg) == ("lidar_moved", 0.998, 1.0)
     assert roof.reason.startswith("It moved by 1.00°")
-    assert said.edges["front"].deg == pytest.approx(0.5)
-    assert said.edges["front"].sigmas == pytest.approx(5.0)
-    assert said.edges["left"].sigmas == 0.0, "a pair that cannot tell is no evidence"
+    assert message.edges["front"].deg == pytest.approx(0.5)
+    assert message.edges["front"].sigmas == pytest.approx(5.0)
+    assert message.edges["left"].sigmas == 0.0, "a pair that cannot tell is no evidence"
     unknown = snapshot_of(reply_before_checks(), START_NS, [], {}, sensors_of)
     assert (unknown.sensors["roof"].state, unknown.sensors["roof"].probability, unknown.edges) == ("unknown", 0.0, {})
 
@@ -190,10 +192,10 @@ def test_an_act_that_fails_is_an_exit_status(coec: Coec, tmp_path: Path, monkeyp
             pass
 
         def send(self, frames: InstantFrames) -> list[RigSnapshot]:
-            return [told(frames.second)]
+            return [reported(frames.second)]
 
         def finish(self) -> list[RigSnapshot]:
-            return [told(SMALL.longest_s)]
+            return [reported(SMALL.longest_s)]
 
     without_a_service(monkeypatch, Silent)
     outcome = coec("demo", "--rig", "--json", "--output", tmp_path)
@@ -204,7 +206,9 @@ def test_an_act_that_fails_is_an_exit_status(coec: Coec, tmp_path: Path, monkeyp
 
 
 @pytest.mark.fault("a service that checks nothing", "said in a sentence, and no page is written")
-def test_a_service_that_tells_nothing_is_an_error(coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_service_that_is_uninformative_is_an_error(
+    coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class Mute:
         def __init__(self, *_: object) -> None:
             pass
@@ -226,7 +230,7 @@ def test_a_service_that_tells_nothing_is_an_error(coec: Coec, tmp_path: Path, mo
 @pytest.mark.fault(
     "a LiDAR, and on another drive a camera, is knocked by 1°", "that sensor alone is named, within a minute"
 )
-def test_a_knocked_lidar_and_a_knocked_camera_are_told_apart(
+def test_a_displaced_lidar_and_a_displaced_camera_are_distinguished(
     coec: Coec, tmp_path: Path, record_property: Callable[[str, object], None]
 ) -> None:
     outcome = coec("demo", "--rig", "--json", "--output", tmp_path / "demo")

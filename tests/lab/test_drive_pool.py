@@ -39,7 +39,7 @@ def test_nothing_to_do_is_nothing_done() -> None:
     assert list(finished(died, [], None)) == []
 
 
-def test_a_process_that_dies_is_told_with_what_to_do() -> None:
+def test_a_process_that_dies_is_reported_with_what_to_do() -> None:
     with pytest.raises(DrivesError, match="fewer --jobs"):
         list(finished(died, range(4), 2))
 
@@ -56,12 +56,12 @@ if __name__ == "__main__":
 
 @pytest.mark.fault("a command that draws on many cores is killed", "none of its processes goes on")
 def test_of_a_command_that_is_killed_nothing_goes_on(tmp_path: Path) -> None:
-    script, begun = tmp_path / "killed.py", tmp_path / "begun"
+    script, started = tmp_path / "killed.py", tmp_path / "begun"
     script.write_text(KILLED)
-    begun.mkdir()
-    command = subprocess.Popen([sys.executable, script, begun], env={**os.environ, "PYTHONPATH": ":".join(sys.path)})
+    started.mkdir()
+    command = subprocess.Popen([sys.executable, script, started], env={**os.environ, "PYTHONPATH": ":".join(sys.path)})
     deadline_s = time.monotonic() + PATIENCE_S
-    while len(pids := list(begun.iterdir())) < 2:
+    while len(pids := list(started.iterdir())) < 2:
         assert time.monotonic() < deadline_s, "no drive was begun"
         time.sleep(0.05)
     command.kill()

@@ -126,8 +126,8 @@ def test_output_folder_holds_table_report_and_pictures(
     assert "How many frames it takes" in page
 
     rows = list(csv.DictReader((written / "starts.csv").read_text().splitlines()))
-    wanted = perturbations(3, np.radians(2.0), 0.1)
-    for row, xi in zip(rows, wanted, strict=True):
+    expected = perturbations(3, np.radians(2.0), 0.1)
+    for row, xi in zip(rows, expected, strict=True):
         assert np.radians(float(row["start_ry_deg"])) == pytest.approx(xi[1], abs=1e-9)
         assert float(row["start_tz_m"]) == pytest.approx(xi[5], abs=1e-9)
     errors = [float(row["rotation_deg"]) for row in rows]
@@ -157,7 +157,7 @@ def test_methods_side_by_side(coec: Coec, tmp_path: Path) -> None:
     assert (tmp_path / "out" / "bullseye.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_methods_side_by_side_in_words(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_methods_side_by_side_as_text(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("coec_lab.simulation.source.open_sim", lambda query: without_intensity(rendered_drive(query)))
     outcome = coec(
         "evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "2", "--directions", "1", "--frames", "2",
@@ -283,7 +283,7 @@ def test_detection_is_the_table_of_diagnose(coec: Coec, monkeypatch: pytest.Monk
     assert all(row["checks"] == 2 for row in detection["moves"])
 
 
-def test_knocks_are_laid_into_the_recording(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_displacements_are_projected_into_the_recording(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         solve_experiments,
         "MOUNT_STEPS",
@@ -314,8 +314,8 @@ def test_normalised_errors_of_windows_and_halves(coec: Coec, tmp_path: Path) -> 
     assert EvaluationReport.model_validate(outcome.document).model_dump(mode="json") == outcome.document
     assert windows["judged"] + windows["refused"] == halves["judged"] + halves["refused"] == 2
     assert (halves["against"], halves["independent"] <= 1) == ("the other half of the frames", True)
-    for found in (windows, halves):
-        assert [sum(counts) for counts in found["histogram"]][:3] == [found["judged"]] * 3
+    for result in (windows, halves):
+        assert [sum(counts) for counts in result["histogram"]][:3] == [result["judged"]] * 3
     assert outcome.document["halves"] is None
     assert (tmp_path / "out" / "normalised.png").read_bytes().startswith(b"\x89PNG")
 
@@ -332,11 +332,11 @@ def test_a_simulated_drive_is_held_against_its_truth(coec: Coec, monkeypatch: py
 
     monkeypatch.setattr("coec_lab.simulation.source.open_sim", known)
     arguments = (SMALL, "--depth", "stereo", "--rotation-deg", "1", "--directions", "1", "--objective", "mi")
-    found = coec("evaluate", *arguments, "--nees", "1", "--json").document["normalised"][0]
-    assert found["against"] == "the simulated truth"
-    assert (found["judged"], found["refused"]) == (1, 0)
-    assert found["rms"][0] == pytest.approx(3.0, abs=0.5)
-    assert found["within_3_sigma"][0] == 0.0
+    result = coec("evaluate", *arguments, "--nees", "1", "--json").document["normalised"][0]
+    assert result["against"] == "the simulated truth"
+    assert (result["judged"], result["refused"]) == (1, 0)
+    assert result["rms"][0] == pytest.approx(3.0, abs=0.5)
+    assert result["within_3_sigma"][0] == 0.0
 
 
 CLOSURE = ("evaluate", "--closure", SMALL, SMALL, "--depth", "stereo", "--objective", "mi", "--rotation-deg", "1")
@@ -354,7 +354,7 @@ def test_closure_misses_a_pose_by_what_it_is_off(coec: Coec, tmp_path: Path) -> 
     assert (tmp_path / "out" / "normalised.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_closure_in_words(coec: Coec) -> None:
+def test_closure_as_text(coec: Coec) -> None:
     outcome = coec(*CLOSURE, "--directions", "1", "--frames", "2")
     assert "two cameras, one LiDAR; A in the frame of B, as the recordings tell: 0.000 deg" in outcome.out
     assert "errors against the known pose between both" in outcome.out
@@ -362,7 +362,7 @@ def test_closure_in_words(coec: Coec) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "reported"),
     [
         (("evaluate", "--rotation-deg", "1"), "give a SOURCE, or --closure A B"),
         (("evaluate", SMALL, "--closure", SMALL, SMALL, "--rotation-deg", "1"), "not both"),
@@ -372,14 +372,14 @@ def test_closure_in_words(coec: Coec) -> None:
     ],
 )
 def test_what_does_not_go_together_is_refused_before_the_work(
-    coec: Coec, arguments: tuple[str, ...], said: str
+    coec: Coec, arguments: tuple[str, ...], reported: str
 ) -> None:
     outcome = coec(*arguments)
     assert outcome.status == 2
-    assert said in outcome.err
+    assert reported in outcome.err
 
 
-def test_a_user_without_a_home_gets_plots_without_words_of_the_library_that_draws(tmp_path: Path) -> None:
+def test_a_user_without_a_home_gets_plots_without_text_of_the_library_that_draws(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     env = {"PYTHONPATH": ":".join(sys.path), "HOME": str(tmp_path / "file"), "TMPDIR": str(tmp_path)}
     command = [sys.executable, "-c", "import coec_lab, matplotlib.figure"]

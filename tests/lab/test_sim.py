@@ -24,11 +24,11 @@ SHORT = ("--seed", 4, "--seconds", 0.6, "--camera", "fisheye96", "--lidar", 16, 
 
 
 @pytest.fixture(autouse=True)
-def drawn_once() -> None:
+def rendered_once() -> None:
     """Here the drawing itself is under test."""
 
 
-def test_a_drive_reads_back_with_its_truth_beside_it(coec: Coec, tmp_path: Path) -> None:
+def test_a_drive_reads_back_with_its_truth_next_to_it(coec: Coec, tmp_path: Path) -> None:
     path = tmp_path / "drive.mcap"
     outcome = coec(
         "sim", "drive", "--output", path, *SHORT, "--fault", "step:0.3:rx=3", "--workshop", "0,2,0", "--json"
@@ -48,8 +48,8 @@ def test_a_drive_reads_back_with_its_truth_beside_it(coec: Coec, tmp_path: Path)
         if isinstance(ours, LidarFrame) and isinstance(theirs, LidarFrame):
             np.testing.assert_array_equal(ours.xyz_m, theirs.xyz_m)
     with AnyReader([path]) as reader:
-        chosen = [connection for connection in reader.connections if connection.topic == "/ground_truth/tf"]
-        messages: list[Any] = [reader.deserialize(data, of.msgtype) for of, _, data in reader.messages(chosen)]
+        selected = [connection for connection in reader.connections if connection.topic == "/ground_truth/tf"]
+        messages: list[Any] = [reader.deserialize(data, of.msgtype) for of, _, data in reader.messages(selected)]
     truth = [message.transforms[0].transform.translation for message in messages]
     camera_lidar = [np.array([t.x, t.y, t.z]) for t in truth[::2]]
     assert len(camera_lidar) == 3
@@ -64,7 +64,7 @@ def test_a_picture(coec: Coec, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "reported"),
     [
         (("drive", "--output", "drive.bag"), ".mcap"),
         (("drive", "--output", "drive.mcap", "--fault", "rust:3"), "unknown fault"),
@@ -72,10 +72,10 @@ def test_a_picture(coec: Coec, tmp_path: Path) -> None:
         (("view", "--output", "view.png"), ".jpg"),
     ],
 )
-def test_what_does_not_fit_is_refused(coec: Coec, arguments: tuple[str, ...], said: str) -> None:
+def test_what_does_not_fit_is_refused(coec: Coec, arguments: tuple[str, ...], reported: str) -> None:
     outcome = coec("sim", *arguments)
     assert outcome.status == 2
-    assert said in outcome.err
+    assert reported in outcome.err
 
 
 def test_failure_leaves_nothing_behind(coec: Coec, tmp_path: Path) -> None:
@@ -84,7 +84,7 @@ def test_failure_leaves_nothing_behind(coec: Coec, tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_a_drive_is_overwritten_only_if_asked(coec: Coec, tmp_path: Path) -> None:
+def test_a_drive_is_overwritten_only_on_request(coec: Coec, tmp_path: Path) -> None:
     path = tmp_path / "drive.mcap"
     path.write_bytes(b"an hour of driving")
     refused = coec("sim", "drive", "--output", path, *SHORT)
@@ -98,7 +98,7 @@ def test_a_failed_drive_of_a_rig_does_not_refuse_the_next(
     coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "rig"
-    words = ("sim", "drive", "--output", folder, *RIG, "--seconds", 0.25)
+    text = ("sim", "drive", "--output", folder, *RIG, "--seconds", 0.25)
 
     def full_disk(path: Path, data: bytes) -> Path:
         if path.name == "rear.yaml":
@@ -107,10 +107,10 @@ def test_a_failed_drive_of_a_rig_does_not_refuse_the_next(
 
     with monkeypatch.context() as patch:
         patch.setattr("coec_lab.commands.drive_bags.write_output", full_disk)
-        assert coec(*words).status == 1
+        assert coec(*text).status == 1
     assert list(folder.iterdir()) == []
-    assert coec(*words).status == 0
-    again = coec(*words)
+    assert coec(*text).status == 0
+    again = coec(*text)
     assert again.status == 1
     assert f"{folder / 'drive.mcap'}" in again.err
 
@@ -137,10 +137,10 @@ def test_a_rig_is_one_bag_whose_pairs_read_back_with_their_masks(coec: Coec, tmp
     assert outcome.status == 0
     assert outcome.document["frames"] == 7
     assert len(outcome.document["sources"]) == 12
-    words = "rig=four-fisheyes&seed=4&seconds=0.25&camera=fisheye64&camera_hz=4&lidar_hz=4&scene=room"
-    words += "&faults=roof:step:0:rz=2"
+    text = "rig=four-fisheyes&seed=4&seconds=0.25&camera=fisheye64&camera_hz=4&lidar_hz=4&scene=room"
+    text += "&faults=roof:step:0:rz=2"
     for name in ("rear-roof", "right-near_right"):
-        back, drive = open_source(outcome.document["sources"][name]), open_source(f"sim:{words}&pair={name}")
+        back, drive = open_source(outcome.document["sources"][name]), open_source(f"sim:{text}&pair={name}")
         np.testing.assert_allclose(back.rig.T_camera_lidar_nominal, drive.rig.T_camera_lidar_nominal, atol=1e-9)
         np.testing.assert_allclose(back.rig.T_lidar_ego, drive.rig.T_lidar_ego, atol=1e-9)
         assert back.rig.mask is not None
@@ -154,19 +154,19 @@ def test_a_rig_is_one_bag_whose_pairs_read_back_with_their_masks(coec: Coec, tmp
             if isinstance(ours, LidarFrame) and isinstance(theirs, LidarFrame):
                 np.testing.assert_array_equal(ours.xyz_m, theirs.xyz_m)
     lidars = open_lidars(outcome.document["written"], "/roof/points", "/near_left/points")
-    whole = open_lidars(f"sim:{words}", "roof", "near_left")
+    whole = open_lidars(f"sim:{text}", "roof", "near_left")
     np.testing.assert_allclose(lidars.rig.T_a_b_nominal, whole.rig.T_a_b_nominal, atol=1e-9)
     np.testing.assert_allclose(lidars.rig.T_a_ego, whole.rig.T_a_ego, atol=1e-9)
-    (read,), (drawn,) = lidars.pairs(12), whole.pairs(12)
-    for mine, yours in ((read.a, drawn.a), (read.b, drawn.b)):
+    (read,), (rendered,) = lidars.pairs(12), whole.pairs(12)
+    for mine, yours in ((read.a, rendered.a), (read.b, rendered.b)):
         np.testing.assert_array_equal(mine.xyz_m, yours.xyz_m)
     assert read.motion is not None
-    assert drawn.motion is not None
-    assert read.motion == replace(drawn.motion, sequence=None)
+    assert rendered.motion is not None
+    assert read.motion == replace(rendered.motion, sequence=None)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "reported"),
     [
         (("--output", "rig.mcap", *RIG), "name a folder"),
         (("--output", "rig", *RIG, "--lidar", "16"), "--lidar of a rig"),
@@ -175,7 +175,7 @@ def test_a_rig_is_one_bag_whose_pairs_read_back_with_their_masks(coec: Coec, tmp
         (("--output", "rig", *RIG, "--fault", "step:1:rx=1"), "of which sensor"),
     ],
 )
-def test_what_a_rig_does_not_take_is_refused(coec: Coec, arguments: tuple[str, ...], said: str) -> None:
+def test_what_a_rig_does_not_take_is_refused(coec: Coec, arguments: tuple[str, ...], reported: str) -> None:
     outcome = coec("sim", "drive", *arguments)
     assert outcome.status == 2
-    assert said in outcome.err
+    assert reported in outcome.err

@@ -41,7 +41,7 @@ def test_a_drive_that_has_a_result_is_not_checked_again(
     assert "resampled" in again.out
 
 
-def test_a_single_look_at_a_highway_is_faint(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_single_observation_of_a_highway_is_faint(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where guard rails, markings and horizon fit nearly as well most of a degree beside."""
     monkeypatch.setitem(check_drives.RIGS, "wide", "lidar=64&camera=pinhole640x400")
     monkeypatch.setattr(check_drives, "CHECKS", 1)
@@ -52,7 +52,7 @@ def test_a_single_look_at_a_highway_is_faint(monkeypatch: pytest.MonkeyPatch) ->
     assert (check.faint, check.causes) == (("looks",), ())  # one frame says what the other says
 
 
-def test_a_drive_that_cannot_be_drawn_is_a_row_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_that_cannot_be_rendered_is_a_row_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(check_drives.RIGS, "box", "camera=box")
     (row,) = check_drives.run([CheckDrive("box", "street", 1)], {})
     assert row.failure is not None

@@ -33,17 +33,17 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_a_drive_that_has_a_result_is_not_run_again(coec: Coec, tmp_path: Path, ran: list[str]) -> None:
-    chosen = [drive.name for drive in matrix_drives.selected_drives(1, PAIR)]
+    selected = [drive.name for drive in matrix_drives.selected_drives(1, PAIR)]
     first = coec("sim", "matrix", "--output", tmp_path, "--only", PAIR, "--dof", 3, "--jobs", 1, "--json")
-    assert (first.status, ran, first.document["drives"]) == (0, chosen, len(chosen))
+    assert (first.status, ran, first.document["drives"]) == (0, selected, len(selected))
     assert (tmp_path / "normalised.png").read_bytes()[:4] == b"\x89PNG"
-    (tmp_path / "drives" / f"{chosen[0]}.json").write_text("half of a fi")
+    (tmp_path / "drives" / f"{selected[0]}.json").write_text("half of a fi")
     again = coec("sim", "matrix", "--output", tmp_path, "--only", PAIR, "--dof", 3, "--jobs", 1, "--json")
-    assert ran[len(chosen) :] == chosen[:1]  # the damaged one
+    assert ran[len(selected) :] == selected[:1]  # the damaged one
     assert again.document == first.document
     other = coec("sim", "matrix", "--output", tmp_path, "--only", PAIR, "--frames", 7, "--dof", 3, "--jobs", 1)
-    assert ran[len(chosen) + 1 :] == chosen  # another question
-    assert f"{chosen[0]}" in other.out
+    assert ran[len(selected) + 1 :] == selected  # another question
+    assert f"{selected[0]}" in other.out
     assert "refused hit: runner_up" in other.out
     assert "accepted and wrong" in other.out
 
@@ -53,38 +53,38 @@ def test_what_does_not_fit_is_refused(coec: Coec, tmp_path: Path) -> None:
     assert (outcome.status, "street_fisheye_64_day_none_s1" in outcome.err) == (2, True)
 
 
-def test_a_drive_is_drawn_solved_and_watched(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_is_rendered_solved_and_watched(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(matrix_drives.LENSES, "tiny", "camera=pinhole240x120")
     settings = Settings((3, 6), 2, "stereo")
     drive = MatrixDrive("room-empty", "tiny", "32", "day", "none", matrix_drives.FIRST_SEED)
-    found = matrix_drives.run(drive, settings)
-    assert found.failure is None
-    assert [len(found.windows[key]) for key in ("3", "6")] == [2, 2]
-    for window in (*found.windows["3"], *found.windows["6"]):
+    result = matrix_drives.run(drive, settings)
+    assert result.failure is None
+    assert [len(result.windows[key]) for key in ("3", "6")] == [2, 2]
+    for window in (*result.windows["3"], *result.windows["6"]):
         assert window.pairs == 2
         assert 2.0 <= window.start_deg <= 10.0
         assert window.failure is not None or window.evaluations > 0
-    assert [(watched.moved, watched.checks) for watched in found.watched] == [
+    assert [(watched.moved, watched.checks) for watched in result.watched] == [
         ("right", 1),
         ("0.5 deg", 1),
         ("1 deg", 1),
     ]
 
 
-def test_a_drive_that_cannot_be_drawn_is_a_row_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_that_cannot_be_rendered_is_a_row_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(matrix_drives.LENSES, "box", "camera=box")
     drive = MatrixDrive("street", "box", "32", "day", "none", matrix_drives.FIRST_SEED)
-    found = matrix_drives.run(drive, Settings((3,), 2, "stereo"))
-    assert found.failure is not None
-    assert "unknown camera 'box'" in found.failure
-    assert found.windows == {}
+    result = matrix_drives.run(drive, Settings((3,), 2, "stereo"))
+    assert result.failure is not None
+    assert "unknown camera 'box'" in result.failure
+    assert result.windows == {}
 
 
 @pytest.mark.slow
 def test_several_processes_give_the_rows_of_one(coec: Coec, tmp_path: Path) -> None:
-    words = ("--only", "room-empty_*", "--frames", 2, "--dof", 3, "--json")
+    text = ("--only", "room-empty_*", "--frames", 2, "--dof", 3, "--json")
     one, two = (
-        coec("sim", "matrix", "--output", tmp_path / str(jobs), "--jobs", jobs, *words).document for jobs in (1, 2)
+        coec("sim", "matrix", "--output", tmp_path / str(jobs), "--jobs", jobs, *text).document for jobs in (1, 2)
     )
     assert one["drives"] == 2
     for row_of_one, row_of_two in zip(one["rows"], two["rows"], strict=True):

@@ -11,7 +11,7 @@ from coec_lab.experiments.rig_moves import RigFault
 from coec_lab.experiments.simulation_schemas import RigMovesReport
 
 
-def test_a_knocked_camera_is_named_on_drawn_drives_and_told_in_tables(
+def test_a_displaced_camera_is_named_on_rendered_drives_and_reported_in_tables(
     coec: Coec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(rig_moves, "FAULTS", ((FOUR, RigFault("one camera 1°", cameras=1)),))

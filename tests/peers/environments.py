@@ -24,7 +24,7 @@ class Peer:
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
 
-    def ask(self, **request: Any) -> dict[str, Any]:
+    def query(self, **request: Any) -> dict[str, Any]:
         """What it answers; what it complains of fails the test."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None

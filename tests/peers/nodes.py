@@ -28,7 +28,7 @@ from peers.environments import PEERS, TIMEOUT_S, python_of
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 
-Heard = Callable[[str, bytes], None]
+Received = Callable[[str, bytes], None]
 
 DOMAINS = 101
 """ROS_DOMAIN_ID from 0 on: above, its ports may be those that Linux gives to others."""
@@ -49,9 +49,9 @@ class Topic:
 class Node:
     """A node in a process of its own."""
 
-    def __init__(self, process: subprocess.Popen[bytes], heard: Heard) -> None:
+    def __init__(self, process: subprocess.Popen[bytes], received: Received) -> None:
         self._process = process
-        self._heard = heard
+        self._received = received
         self._writing = threading.Lock()
         self._changed = threading.Condition()
         self._peers: dict[str, int] = {}
@@ -90,13 +90,13 @@ class Node:
                     self._peers[head["matched"]] = head["peers"]
                     self._changed.notify_all()
             else:
-                self._heard(head["topic"], payload)
+                self._received(head["topic"], payload)
 
 
 @contextmanager
-def node(name: str, publish: Mapping[str, Topic], subscribe: Mapping[str, Topic], heard: Heard) -> Iterator[Node]:
+def node(name: str, publish: Mapping[str, Topic], subscribe: Mapping[str, Topic], received: Received) -> Iterator[Node]:
     """A real node; `heard` gets what it receives, in CDR, on a thread of its own."""
-    told = {
+    reported = {
         "name": name,
         "publish": {topic: {"type": one.type, "latched": one.latched} for topic, one in publish.items()},
         "subscribe": {topic: {"type": one.type, "latched": one.latched} for topic, one in subscribe.items()},
@@ -107,10 +107,10 @@ def node(name: str, publish: Mapping[str, Topic], subscribe: Mapping[str, Topic]
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
     }
-    command = [str(python_of("ros2")), str(PEERS / "ros2" / "node_worker.py"), json.dumps(told)]
+    command = [str(python_of("ros2")), str(PEERS / "ros2" / "node_worker.py"), json.dumps(reported)]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment) as process:
-        running = Node(process, heard)
+        running = Node(process, received)
         try:
             yield running
         finally:
@@ -138,9 +138,9 @@ def relay(session: zenoh.Session, to_zenoh: Mapping[str, Topic], to_ros: Mapping
         )
 
     def to_key(topic: str, payload: bytes) -> None:
-        told = values_of(to_zenoh[topic].type, payload)
-        if (topic, True, told) not in brought:
-            brought.add((topic, False, told))
+        reported = values_of(to_zenoh[topic].type, payload)
+        if (topic, True, reported) not in brought:
+            brought.add((topic, False, reported))
             publishers[topic].put(payload)
 
     with node("relay", to_ros, to_zenoh, to_key) as running:
@@ -149,9 +149,9 @@ def relay(session: zenoh.Session, to_zenoh: Mapping[str, Topic], to_ros: Mapping
 
             def to_topic(sample: zenoh.Sample, topic: str = topic) -> None:
                 payload = sample.payload.to_bytes()
-                told = values_of(to_ros[topic].type, payload)
-                if (topic, False, told) not in brought:
-                    brought.add((topic, True, told))
+                reported = values_of(to_ros[topic].type, payload)
+                if (topic, False, reported) not in brought:
+                    brought.add((topic, True, reported))
                     running.publish(topic, payload)
 
             key = topic.lstrip("/")
@@ -186,7 +186,7 @@ class Inbox:
         self._messages: dict[str, list[bytes]] = {}
         self._changed = threading.Condition()
 
-    def hear(self, topic: str, payload: bytes) -> None:
+    def receive(self, topic: str, payload: bytes) -> None:
         """A message came."""
         with self._changed:
             self._messages.setdefault(topic, []).append(payload)

@@ -26,6 +26,6 @@ def readers() -> Iterator[Peer]:
 @pytest.mark.parametrize("name", sorted(formats().keys() - OURS))
 def test_others_read_the_same_transform(readers: Peer, name: str) -> None:
     for seed in range(20):
-        told = exported_extrinsic(np.random.default_rng(seed).uniform(-2.0, 2.0, 6))
-        read = readers.ask(format=name, text=formats()[name].text(told, None))
-        np.testing.assert_allclose(read["T_child_parent"], told.T_child_parent, atol=TOLERANCE, rtol=0)
+        reported = exported_extrinsic(np.random.default_rng(seed).uniform(-2.0, 2.0, 6))
+        read = readers.query(format=name, text=formats()[name].text(reported, None))
+        np.testing.assert_allclose(read["T_child_parent"], reported.T_child_parent, atol=TOLERANCE, rtol=0)

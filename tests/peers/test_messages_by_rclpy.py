@@ -66,7 +66,7 @@ def known(rclpy: Peer, type_name: str) -> str:
 
 def has_tf(rclpy: Peer) -> bool:
     try:
-        rclpy.ask(do="hash", type=messages.TF)
+        rclpy.query(do="hash", type=messages.TF)
     except AssertionError:
         return False
     return True
@@ -110,36 +110,36 @@ def plain(value: Any) -> Any:
     return value
 
 
-def told_by(rclpy: Peer, type_name: str, payload: bytes) -> Any:
-    fields_of = rclpy.ask(do="read", type=known(rclpy, type_name), cdr=payload.hex())["fields"]
+def reported_by(rclpy: Peer, type_name: str, payload: bytes) -> Any:
+    fields_of = rclpy.query(do="read", type=known(rclpy, type_name), cdr=payload.hex())["fields"]
     return levelled(fields_of)
 
 
-def levelled(told: Any) -> Any:
+def levelled(reported: Any) -> Any:
     """`byte` is bytes of length one in rclpy, and a number in rosbags."""
-    if isinstance(told, Mapping):
-        return {name: item[0] if name == "level" else levelled(item) for name, item in told.items()}
-    return [levelled(item) for item in told] if isinstance(told, list) else told
+    if isinstance(reported, Mapping):
+        return {name: item[0] if name == "level" else levelled(item) for name, item in reported.items()}
+    return [levelled(item) for item in reported] if isinstance(reported, list) else reported
 
 
 @pytest.mark.parametrize(("type_name", "payload"), written(), ids=names)
 def test_what_is_written_is_read_by_rclpy(rclpy: Peer, type_name: str, payload: bytes) -> None:
-    assert told_by(rclpy, type_name, payload) == plain(STORE.deserialize_cdr(payload, type_name))
+    assert reported_by(rclpy, type_name, payload) == plain(STORE.deserialize_cdr(payload, type_name))
 
 
-def test_values_arrive_where_a_node_looks_for_them(rclpy: Peer) -> None:
-    cloud = told_by(rclpy, messages.POINT_CLOUD, message_encoding.encode_cloud(SWEEP))
+def test_values_arrive_where_a_node_searches_them(rclpy: Peer) -> None:
+    cloud = reported_by(rclpy, messages.POINT_CLOUD, message_encoding.encode_cloud(SWEEP))
     x = next(field for field in cloud["fields"] if field["name"] == "x")
     assert (x["offset"], x["datatype"], x["count"]) == (0, 7, 1)
     assert bytes(cloud["data"][:12]) == SWEEP.xyz_m[0].tobytes()
-    odometry = told_by(rclpy, messages.ODOMETRY, message_encoding.encode_motion(MOTION)[1])
+    odometry = reported_by(rclpy, messages.ODOMETRY, message_encoding.encode_motion(MOTION)[1])
     assert odometry["twist"]["twist"]["linear"] == {"x": 12.5, "y": -1e-9, "z": 0.0}
 
 
 @pytest.mark.parametrize(("type_name", "payload"), written(), ids=names)
 def test_what_rclpy_writes_coec_reads(rclpy: Peer, type_name: str, payload: bytes) -> None:
-    fields_of = rclpy.ask(do="read", type=known(rclpy, type_name), cdr=payload.hex())["fields"]
-    theirs = bytes.fromhex(rclpy.ask(do="write", type=type_name, fields=fields_of)["cdr"])
+    fields_of = rclpy.query(do="read", type=known(rclpy, type_name), cdr=payload.hex())["fields"]
+    theirs = bytes.fromhex(rclpy.query(do="write", type=type_name, fields=fields_of)["cdr"])
     assert plain(STORE.deserialize_cdr(theirs, type_name)) == plain(STORE.deserialize_cdr(payload, type_name))
     if type_name in FRAMES:
         assert plain(message_decoding.decode(type_name, theirs, LIMITS)) == plain(
@@ -149,7 +149,7 @@ def test_what_rclpy_writes_coec_reads(rclpy: Peer, type_name: str, payload: byte
 
 @pytest.mark.parametrize("type_name", sorted({value for value in vars(messages).values() if "/msg/" in str(value)}))
 def test_types_have_the_hash_of_ros(rclpy: Peer, type_name: str) -> None:
-    assert rclpy.ask(do="hash", type=known(rclpy, type_name))["hash"] == messages.type_hash(type_name)
+    assert rclpy.query(do="hash", type=known(rclpy, type_name))["hash"] == messages.type_hash(type_name)
 
 
 def test_every_message_of_a_window_is_read_by_rclpy(rclpy: Peer, tmp_path: Path) -> None:
@@ -165,7 +165,7 @@ def test_every_message_of_a_window_is_read_by_rclpy(rclpy: Peer, tmp_path: Path)
         for schema, channel, message in make_reader(stream).iter_messages():
             if schema is None or schema.encoding != "ros2msg" or (schema.name == messages.TF and not has_tf(rclpy)):
                 continue
-            theirs = told_by(rclpy, schema.name, message.data)
+            theirs = reported_by(rclpy, schema.name, message.data)
             assert theirs == plain(STORE.deserialize_cdr(message.data, schema.name)), channel.topic
             read.add(schema.name)
     assert read >= FRAMES - {messages.IMU} | {messages.CAMERA_INFO}

@@ -13,23 +13,23 @@ IMAGE, SPEED = "/front/image/compressed", "/speed"
 WITHIN_S = 60.0
 
 
-def test_messages_go_both_ways() -> None:
+def test_messages_go_both_directions() -> None:
     image, speed = compressed_image(), twist()
     inbox, keys = Inbox(), Inbox()
     with routing() as router:
 
-        def heard(sample: zenoh.Sample) -> None:
-            keys.hear(str(sample.key_expr), sample.payload.to_bytes())
+        def received(sample: zenoh.Sample) -> None:
+            keys.receive(str(sample.key_expr), sample.payload.to_bytes())
 
-        subscriber = router.session.declare_subscriber("front/image/compressed", heard)
+        subscriber = router.session.declare_subscriber("front/image/compressed", received)
         camera, motion = {IMAGE: Topic(messages.COMPRESSED_IMAGE)}, {SPEED: Topic(messages.TWIST, latched=True)}
-        with relay(router.session, camera, motion), node("vehicle", camera, motion, inbox.hear) as vehicle:
+        with relay(router.session, camera, motion), node("vehicle", camera, motion, inbox.receive) as vehicle:
             vehicle.wait_for_peers(IMAGE, SPEED)
             vehicle.publish(IMAGE, image)
-            (came,) = keys.until("front/image/compressed", lambda found: len(found) == 1, "an image", WITHIN_S)
+            (arrived,) = keys.until("front/image/compressed", lambda result: len(result) == 1, "an image", WITHIN_S)
             router.session.put("speed", speed)
-            (back,) = inbox.until(SPEED, lambda found: len(found) == 1, "a speed", WITHIN_S)
+            (back,) = inbox.until(SPEED, lambda result: len(result) == 1, "a speed", WITHIN_S)
         subscriber.undeclare()
-    assert came[:4] == b"\0\1\0\0"
-    assert image[-40:] in came
+    assert arrived[:4] == b"\0\1\0\0"
+    assert image[-40:] in arrived
     assert len(back) - len(speed) in range(-3, 4)

@@ -39,7 +39,7 @@ SENSORS = {
     ODOMETRY: Topic(messages.ODOMETRY),
     TF_STATIC: Topic(messages.TF, latched=True),
 }
-TOLD = {DIAGNOSTICS: Topic(messages.DIAGNOSTICS), TF_STATIC: Topic(messages.TF, latched=True)}
+REPORTED = {DIAGNOSTICS: Topic(messages.DIAGNOSTICS), TF_STATIC: Topic(messages.TF, latched=True)}
 
 CONFIGURATION = """vehicle: shuttle-7
 zenoh: {{connect: [{endpoint}]}}
@@ -108,25 +108,27 @@ class Drivers:
 
 
 def levels(inbox: Inbox) -> list[int]:
-    told: list[Any] = [STORE.deserialize_cdr(data, messages.DIAGNOSTICS) for data in inbox.messages(DIAGNOSTICS)]
-    assert all(status.name == "coec: front_calibration" for array in told for status in array.status)
-    return [status.level for array in told for status in array.status]
+    reported: list[Any] = [STORE.deserialize_cdr(data, messages.DIAGNOSTICS) for data in inbox.messages(DIAGNOSTICS)]
+    assert all(status.name == "coec: front_calibration" for array in reported for status in array.status)
+    return [status.level for array in reported for status in array.status]
 
 
 def calibrated(inbox: Inbox) -> list[Any]:
-    told: list[Any] = [STORE.deserialize_cdr(data, messages.TF) for data in inbox.messages(TF_STATIC)]
-    return [joint for message in told for joint in message.transforms if joint.child_frame_id.endswith("_calibrated")]
+    reported: list[Any] = [STORE.deserialize_cdr(data, messages.TF) for data in inbox.messages(TF_STATIC)]
+    return [
+        joint for message in reported for joint in message.transforms if joint.child_frame_id.endswith("_calibrated")
+    ]
 
 
 def test_nodes_see_a_knock_and_the_calibrated_frame(tmp_path: Path, drive: Drive, router: Router) -> None:
     config = tmp_path / "coec.yaml"
     config.write_text(CONFIGURATION.format(endpoint=router.endpoint))
     inbox = Inbox()
-    with relay(router.session, SENSORS, TOLD), node("vehicle", SENSORS, TOLD, inbox.hear) as vehicle:
+    with relay(router.session, SENSORS, REPORTED), node("vehicle", SENSORS, REPORTED, inbox.receive) as vehicle:
         vehicle.wait_for_peers(*SENSORS, DIAGNOSTICS)
         drivers = Drivers(vehicle, drive)
         with service(config, router) as running:
-            inbox.until(DIAGNOSTICS, lambda told: len(told) > 1, "diagnostics from the first second", WITHIN_S)
+            inbox.until(DIAGNOSTICS, lambda reported: len(reported) > 1, "diagnostics from the first second", WITHIN_S)
             assert set(levels(inbox)) == {STALE}, "nothing was looked at"
             drivers.publish(drive.between(0, BEGIN_S))
             running.until(running.counters, lambda pair: not pair["awaits"], "what the configuration leaves out")

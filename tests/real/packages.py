@@ -37,10 +37,10 @@ def completed(
 ) -> subprocess.CompletedProcess[str]:
     """A command that has ended, in an environment without modules of this one. Fails the test if the command fails."""
     own = {name: value for name, value in os.environ.items() if name not in FOREIGN} | variables
-    words = [str(word) for word in command]
-    done = subprocess.run(words, cwd=cwd, env=own, capture_output=True, text=True, timeout=PATIENCE_S)
+    text = [str(word) for word in command]
+    done = subprocess.run(text, cwd=cwd, env=own, capture_output=True, text=True, timeout=PATIENCE_S)
     if not may_fail:
-        assert done.returncode == 0, f"{' '.join(words)} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
+        assert done.returncode == 0, f"{' '.join(text)} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
     return done
 
 
@@ -55,11 +55,11 @@ def require_index(scratch: Path) -> None:
 
 def uv() -> str:
     """The program `uv`, or the test is skipped."""
-    beside = Path(sys.executable).parent / "uv"
-    found = str(beside) if beside.exists() else shutil.which("uv")
-    if found is None:
+    neighbour = Path(sys.executable).parent / "uv"
+    result = str(neighbour) if neighbour.exists() else shutil.which("uv")
+    if result is None:
         pytest.skip("needs uv, to resolve versions and to make environments: pip install uv, and have it on PATH")
-    return found
+    return result
 
 
 def copied_checkout(folder: Path) -> Path:

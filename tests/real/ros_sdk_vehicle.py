@@ -29,7 +29,7 @@ OVERLAY, INFO = "/coec/front/overlay/compressed", "/coec/front/camera/camera_inf
 _lock = threading.Lock()
 
 
-def said(**line: Any) -> None:
+def reported(**line: Any) -> None:
     with _lock:
         print(json.dumps(line), flush=True)
 
@@ -43,20 +43,20 @@ def definition(type_name: str) -> dict[str, Any]:
 def diagnostics(message: Any) -> None:
     for status in message.status:
         level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
-        said(topic=DIAGNOSTICS, name=status.name, level=level, message=status.message)
+        reported(topic=DIAGNOSTICS, name=status.name, level=level, message=status.message)
 
 
 def transforms(message: Any) -> None:
     for one in message.transforms:
-        said(topic=TRANSFORMS, parent=one.header.frame_id, child=one.child_frame_id)
+        reported(topic=TRANSFORMS, parent=one.header.frame_id, child=one.child_frame_id)
 
 
 def overlay(message: Any) -> None:
-    said(topic=OVERLAY, format=message.format, jpeg=bytes(message.data[:2]) == b"\xff\xd8")
+    reported(topic=OVERLAY, format=message.format, jpeg=bytes(message.data[:2]) == b"\xff\xd8")
 
 
 def info(message: Any) -> None:
-    said(topic=INFO, width=message.width, model=message.distortion_model)
+    reported(topic=INFO, width=message.width, model=message.distortion_model)
 
 
 def main() -> None:
@@ -70,7 +70,7 @@ def main() -> None:
     ):
         subscribers.append(ROS2Subscriber(topic, kind, take, qos=qos, **definition(kind)))
     publishers: dict[str, Any] = {}
-    said(ready=True)
+    reported(ready=True)
     for line in sys.stdin:
         topic, kind, file = line.split()
         if topic not in publishers:
@@ -79,7 +79,7 @@ def main() -> None:
         message = publisher.session_mgr.store.deserialize_cdr(Path(file).read_bytes(), kind)
         names = [one.name for one in fields(message) if not one.name.startswith("__")]
         publisher.publish(**{name: getattr(message, name) for name in names})
-        said(sent=topic)
+        reported(sent=topic)
     for one in (*publishers.values(), *subscribers):
         one.close()
 

@@ -47,17 +47,17 @@ def libraries(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def window(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A window with its result."""
-    (found,) = recorded_windows(tmp_path_factory.mktemp("windows")).glob("one/*.mcap")
-    return found
+    (result,) = recorded_windows(tmp_path_factory.mktemp("windows")).glob("one/*.mcap")
+    return result
 
 
 @pytest.fixture(scope="module")
 def read(libraries: Path, window: Path) -> Mapping[str, Any]:
     """What Foxglove's libraries find in it."""
     command = ["node", READER.name, str(window)]
-    ended = subprocess.run(command, cwd=libraries, capture_output=True, text=True, timeout=PATIENCE_S)
-    assert ended.returncode == 0, ended.stderr
-    document: Mapping[str, Any] = json.loads(ended.stdout)
+    finished = subprocess.run(command, cwd=libraries, capture_output=True, text=True, timeout=PATIENCE_S)
+    assert finished.returncode == 0, finished.stderr
+    document: Mapping[str, Any] = json.loads(finished.stdout)
     return document
 
 

@@ -45,12 +45,12 @@ def engine() -> str:
     pytest.skip("needs a container engine that runs: Docker, or podman (Debian: apt-get install podman)")
 
 
-def done(*words: object, check: bool = True) -> str:
+def done(*text: object, check: bool = True) -> str:
     """What the engine prints."""
-    command = [engine(), *(str(word) for word in words)]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, cwd=REPOSITORY)
-    assert not check or ended.returncode == 0, f"{command}: {ended.stderr[-4000:]}"
-    return ended.stdout + (ended.stderr if words[0] == "logs" else "")
+    command = [engine(), *(str(word) for word in text)]
+    finished = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, cwd=REPOSITORY)
+    assert not check or finished.returncode == 0, f"{command}: {finished.stderr[-4000:]}"
+    return finished.stdout + (finished.stderr if text[0] == "logs" else "")
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def state_of(name: str) -> dict[str, Any]:
     return dict(document["State"])
 
 
-def has_ended(name: str) -> bool:
+def has_finished(name: str) -> bool:
     return state_of(name)["Status"] in ("exited", "stopped")
 
 
@@ -95,8 +95,8 @@ def alive(name: str) -> str | None:
     """What the health check of the image says; None: it fails."""
     (program,) = stages()[-1].health_check
     command = [engine(), "exec", name, program]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
-    return ended.stdout.strip() if ended.returncode == 0 else None
+    finished = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
+    return finished.stdout.strip() if finished.returncode == 0 else None
 
 
 def configured(folder: Path, **changes: Any) -> Path:
@@ -135,39 +135,39 @@ def test_it_has_a_numeric_user_a_health_check_and_no_installer(image: str, recor
 )
 def test_it_serves_confined_is_alive_and_ends(image: str, tmp_path: Path, record_property: Record) -> None:
     with running(image, [mounted(configured(tmp_path))]) as name:
-        wait_until(lambda: alive(name) is not None or has_ended(name), "a sign of life", PATIENCE_S)
-        said = alive(name)
-        assert said is not None, done("logs", name)
-        assert said.startswith("alive: the last heartbeat is ")
+        wait_until(lambda: alive(name) is not None or has_finished(name), "a sign of life", PATIENCE_S)
+        reported = alive(name)
+        assert reported is not None, done("logs", name)
+        assert reported.startswith("alive: the last heartbeat is ")
         assert done("exec", name, "id", "--user").strip() == "10001"
-        begun_s = time.monotonic()
+        started_s = time.monotonic()
         done("stop", "--time", compose()["coec"]["stop_grace_period"].removesuffix("s"), name)
-        record_property("figure", f"stopped in {time.monotonic() - begun_s:.1f} s")
+        record_property("figure", f"stopped in {time.monotonic() - started_s:.1f} s")
         assert state_of(name)["ExitCode"] == ExitCode.SUCCESS, done("logs", name)
 
 
 def test_where_it_serves_pages_its_health_check_reads_one(image: str, tmp_path: Path) -> None:
     path = configured(tmp_path, metrics={"http": "127.0.0.1:9464"}, model="stereo")
     with running(image, [mounted(path)]) as name:
-        wait_until(lambda: alive(name) is not None or has_ended(name), "a sign of life", PATIENCE_S)
+        wait_until(lambda: alive(name) is not None or has_finished(name), "a sign of life", PATIENCE_S)
         assert alive(name) == "alive: 127.0.0.1:9464 answers", done("logs", name)
 
 
 @pytest.mark.fault("a depth network that is absent, in a container", "exit code 78, and the log names it")
 def test_a_network_that_is_absent_ends_it_with_78(image: str, tmp_path: Path) -> None:
     with running(image, [mounted(configured(tmp_path, model="/absent.onnx"))]) as name:
-        wait_until(lambda: has_ended(name), "its end", PATIENCE_S)
+        wait_until(lambda: has_finished(name), "its end", PATIENCE_S)
         assert state_of(name)["ExitCode"] == ExitCode.CONFIGURATION
         assert "there is no depth network /absent.onnx" in done("logs", name)
 
 
 def router_options(tls: Path) -> list[str]:
     """The volumes of the router in the compose file, with certificates from another folder."""
-    found = []
+    result = []
     for volume in compose()["router"]["volumes"]:
         origin, target, *_ = volume.split(":")
-        found.append(mounted(tls / Path(origin).name if "/tls/" in origin else DEPLOY / origin, target))
-    return found
+        result.append(mounted(tls / Path(origin).name if "/tls/" in origin else DEPLOY / origin, target))
+    return result
 
 
 @pytest.mark.fault(
@@ -180,14 +180,14 @@ def test_a_router_reads_the_certificates_that_are_made_for_it(image: str, tmp_pa
     subprocess.run([DEPLOY / "make-test-ca", tls, "router"], check=True, capture_output=True)
     command = compose()["router"]["command"]
     with running(image, router_options(tls), *command) as name:
-        wait_until(lambda: "routing" in done("logs", name) or has_ended(name), "the router", PATIENCE_S)
-        assert not has_ended(name), done("logs", name)
+        wait_until(lambda: "routing" in done("logs", name) or has_finished(name), "the router", PATIENCE_S)
+        assert not has_finished(name), done("logs", name)
         _, *check = compose()["router"]["healthcheck"]["test"]
         done("exec", name, *check)
     (tls / "router-key.pem").chmod(0o600)
     with running(image, router_options(tls), *command) as name:
-        wait_until(lambda: has_ended(name), "its end", PATIENCE_S)
+        wait_until(lambda: has_finished(name), "its end", PATIENCE_S)
         assert state_of(name)["ExitCode"] == ExitCode.CONFIGURATION
-        said = done("logs", name)
-        assert "/etc/zenoh/tls/router-key.pem belongs to user 0" in said.replace("\n", " "), said
-        assert "with mode 0600, and this process has user 10001" in said.replace("\n", " "), said
+        reported = done("logs", name)
+        assert "/etc/zenoh/tls/router-key.pem belongs to user 0" in reported.replace("\n", " "), reported
+        assert "with mode 0600, and this process has user 10001" in reported.replace("\n", " "), reported

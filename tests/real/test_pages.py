@@ -28,9 +28,9 @@ def environment() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if name not in FOREIGN}
 
 
-def done(words: Sequence[object], cwd: Path) -> subprocess.CompletedProcess[str]:
+def done(text: Sequence[object], cwd: Path) -> subprocess.CompletedProcess[str]:
     """A command to its end."""
-    command = [str(word) for word in words]
+    command = [str(word) for word in text]
     return subprocess.run(command, cwd=cwd, env=environment(), capture_output=True, text=True, timeout=LONG_S)
 
 
@@ -59,8 +59,8 @@ def test_python_of_a_page_works_there(checkout: Path, block: Block, tmp_path: Pa
 
 def test_every_command_loads_its_extras_there(checkout: Path) -> None:
     for module in ("duckdb", "embreex", "foxglove", "fsspec", "pyarrow.parquet", "small_gicp"):
-        found = done([checkout / ".venv" / "bin" / "python", "-c", f"import {module}"], checkout)
-        assert found.returncode == 0, found.stderr
+        result = done([checkout / ".venv" / "bin" / "python", "-c", f"import {module}"], checkout)
+        assert result.returncode == 0, result.stderr
 
 
 def test_the_site_is_built_as_the_readme_says(checkout: Path) -> None:

@@ -38,14 +38,14 @@ the values are right again it must go."""
 
 
 def needed(program: str) -> str:
-    found = shutil.which(program)
-    if found is None:
+    detected = shutil.which(program)
+    if detected is None:
         pytest.skip(f"needs {program} (Debian: apt-get install --no-install-recommends prometheus)")
-    return found
+    return detected
 
 
-def promtool(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
-    command = [needed("promtool"), *(str(word) for word in words)]
+def promtool(*tokens: object, **options: Any) -> subprocess.CompletedProcess[str]:
+    command = [needed("promtool"), *(str(word) for word in tokens)]
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, **options)
 
 
@@ -81,12 +81,12 @@ def _answers(port: int) -> bool:
 
 
 def test_rules_and_configuration_are_read_without_a_complaint() -> None:
-    for words in (
+    for tokens in (
         ("check", "rules", "--lint=all", "--lint-fatal", MONITORING / "alerts.yml"),
         ("check", "config", "--lint=all", "--lint-fatal", MONITORING / "prometheus.yml"),
     ):
-        ended = promtool(*words)
-        assert ended.returncode == 0, ended.stdout + ended.stderr
+        finished = promtool(*tokens)
+        assert finished.returncode == 0, finished.stdout + finished.stderr
 
 
 @pytest.mark.fault(
@@ -115,15 +115,15 @@ def test_alerts_fire_and_go(
         ],
     }
     (tmp_path / "quiet.json").write_text(json.dumps(document))
-    ended = promtool("test", "rules", tmp_path / "quiet.json")
-    assert ended.returncode == 0, ended.stdout + ended.stderr
+    finished = promtool("test", "rules", tmp_path / "quiet.json")
+    assert finished.returncode == 0, finished.stdout + finished.stderr
     document["tests"][0]["alert_rule_test"] = [{"eval_time": fires_at, **quiet}]  # type: ignore[index]
     (tmp_path / "firing.json").write_text(json.dumps(document))
-    ended = promtool("test", "rules", tmp_path / "firing.json")
-    assert ended.returncode != 0, "it does not fire"
-    assert alert in ended.stdout + ended.stderr
-    assert rule["labels"]["severity"] in ended.stdout + ended.stderr
-    assert "truck" in ended.stdout + ended.stderr
+    finished = promtool("test", "rules", tmp_path / "firing.json")
+    assert finished.returncode != 0, "it does not fire"
+    assert alert in finished.stdout + finished.stderr
+    assert rule["labels"]["severity"] in finished.stdout + finished.stderr
+    assert "truck" in finished.stdout + finished.stderr
 
 
 def test_a_scrape_passes_the_lint_and_a_server_reads_both_formats(tmp_path: Path) -> None:

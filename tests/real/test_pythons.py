@@ -53,10 +53,10 @@ def interpreter_of(version: str) -> str:
     on_path = shutil.which(name)
     if on_path is not None and subprocess.run([on_path, "--version"], capture_output=True).returncode == 0:
         return on_path
-    found = completed(uv(), "python", "find", "--no-python-downloads", version, may_fail=True)
-    if found.returncode != 0:
+    result = completed(uv(), "python", "find", "--no-python-downloads", version, may_fail=True)
+    if result.returncode != 0:
         pytest.skip(f"needs Python {version}: have {name} on PATH, or run `uv python install {version}`")
-    return found.stdout.strip()
+    return result.stdout.strip()
 
 
 @pytest.mark.parametrize("version", versions())

@@ -21,7 +21,7 @@ from coec.io.zenoh.player import Frame
 from e2e.drives import Drive, rendered, without_depth
 from e2e.processes import COMMAND, PATIENCE_S, Service, environment, free_endpoint
 from e2e.ros_vehicle import CAMERA, EGO, INFO, POINTS, TF, camera_info, message_of
-from e2e.test_awaited_pair import said
+from e2e.test_pending_pair import reported
 from support import ros as rmw_zenoh_defaults
 from support.fake_worker import wait_until
 
@@ -182,13 +182,13 @@ def test_a_vehicle_of_another_client(python: Path, tmp_path: Path, drive: Drive,
             running = Service(process, router, load_config(config), log)
             wait_until(lambda: STALE in ros.levels(), "/diagnostics before anything was checked", LONG_S)
             running.until(running.status, lambda status: status["state"] == "running", "the worker")
-            ros.put(TF, said(drive))
+            ros.put(TF, reported(drive))
             ros.put(INFO, camera_info(rig.camera, rig.camera_frame))
             for frame in before[:20]:
                 ros.send(frame)
             running.until(running.counters, lambda pair: not pair["awaits"], "the pair is complete")
             running.send_by(ros.send, before)
-            running.until(running.extrinsic, lambda told: told["status"] == "accepted", "the result")
+            running.until(running.extrinsic, lambda reported: reported["status"] == "accepted", "the result")
             error_deg = drive.error_deg(running.extrinsic(), 0)
             child = f"{rig.camera_frame}_calibrated"
             wait_until(lambda: child in [one["child"] for one in ros.got("/tf_static")], "/tf_static", PATIENCE_S)

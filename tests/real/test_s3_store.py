@@ -55,12 +55,12 @@ def server_command() -> list[str]:
     """The command of moto's server, from this environment or the path."""
     if importlib.util.find_spec("moto") is not None:
         return [sys.executable, "-m", "moto.server"]
-    found = shutil.which("moto_server")
-    if found is None:
+    result = shutil.which("moto_server")
+    if result is None:
         pytest.skip(
             "needs moto's server: pip install 'moto[server,s3]' in an environment of its own, and its bin in PATH"
         )
-    return [found]
+    return [result]
 
 
 @pytest.fixture(scope="module")

@@ -131,8 +131,8 @@ def story(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Any]:
     configured(given, "credentials", authority={"anonymous": "never", "senders": [{"name": "operator"}], **places})
     packages = site.getsitepackages()[0]
     # The interpreter finds its library where it was built for only outside of this sandbox.
-    found = "LD_LIBRARY_PATH=/opt/python/lib PYTHONPATH=/opt/service:/opt/packages"
-    program = f'#!/bin/sh\n{found} exec /opt/python/bin/python -m coec "$@"\n'
+    result = "LD_LIBRARY_PATH=/opt/python/lib PYTHONPATH=/opt/service:/opt/packages"
+    program = f'#!/bin/sh\n{result} exec /opt/python/bin/python -m coec "$@"\n'
     prepare = f"""
     {COPY_OF_ROOT}
     rm -rf {ROOT}/etc/coec {ROOT}/opt/coec {ROOT}/var/lib/coec {ROOT}/var/cache/coec
@@ -149,7 +149,7 @@ def story(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Any]:
         --bind-ro={REPOSITORY / "service"}:/opt/service --bind-ro={given}:/given --bind={report}:/report \
         --machine=coec-test --boot
     """
-    ended = subprocess.run(
+    finished = subprocess.run(
         ["unshare", "--mount", "--cgroup", "bash", "-c", prepare],
         env={**os.environ, "PROGRAM": program, "PROBE": PROBE},
         stdin=subprocess.DEVNULL,
@@ -158,14 +158,14 @@ def story(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Any]:
         timeout=PATIENCE_S,
     )
     text = (report / "story").read_text() if (report / "story").exists() else ""
-    said: dict[str, Any] = {"output": ended.stdout[-4000:] + ended.stderr[-4000:]}
+    reported: dict[str, Any] = {"output": finished.stdout[-4000:] + finished.stderr[-4000:]}
     for part in text.split("[")[1:]:
         name, _, lines = part.partition("]\n")
-        said[name] = dict(line.split("=", 1) for line in lines.split())
+        reported[name] = dict(line.split("=", 1) for line in lines.split())
     for path in report.iterdir():
-        said.setdefault(path.name, path.read_text())
-    assert "journal" in said, json.dumps(said, indent=1)[-10_000:]
-    return said
+        reported.setdefault(path.name, path.read_text())
+    assert "journal" in reported, json.dumps(reported, indent=1)[-10_000:]
+    return reported
 
 
 @pytest.mark.fault(

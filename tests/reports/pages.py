@@ -123,8 +123,8 @@ def result(*, accepted: bool = True, vehicle: str = "truck") -> CalibrationResul
 def calibration_report(*, accepted: bool = True, vehicle: str = "truck") -> CalibrationReport:
     """What `coec calibrate` prints of it."""
     sigma = (0.031, 0.0284, 0.05, None, None, None)
-    told = {**dict(result(accepted=accepted, vehicle=vehicle)), "sigma": sigma}
-    return CalibrationReport(**told, elapsed_s={"load": 0.5, "search": 2.5, "total": 3.0})
+    reported = {**dict(result(accepted=accepted, vehicle=vehicle)), "sigma": sigma}
+    return CalibrationReport(**reported, elapsed_s={"load": 0.5, "search": 2.5, "total": 3.0})
 
 
 def calibration(folder: Path, *, accepted: bool = True, vehicle: str = "truck") -> Page:

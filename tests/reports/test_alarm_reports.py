@@ -26,13 +26,13 @@ def test_what_was_not_noticed_in_time_has_no_figure() -> None:
     assert (report.creep_confirmed_h.median, report.creep_confirmed_h.max) == (4.0, None)
 
 
-def test_the_curve_is_drawn() -> None:
+def test_the_curve_is_rendered() -> None:
     assert alarm_statistics.delay_curve(alarm_statistics.document_of(ALARMS)).startswith(b"\x89PNG")
 
 
 def test_the_tables_say_what_is_stated_and_what_was(capsys: pytest.CaptureFixture[str]) -> None:
     alarm_statistics.show(alarm_statistics.document_of(ALARMS))
-    told = capsys.readouterr().out
-    assert "10 h" in told
-    assert "75 %" in told
-    assert "0.1°/h is suspected after 3.0 h and confirmed after 4.0 h" in " ".join(told.split())
+    reported = capsys.readouterr().out
+    assert "10 h" in reported
+    assert "75 %" in reported
+    assert "0.1°/h is suspected after 3.0 h and confirmed after 4.0 h" in " ".join(reported.split())

@@ -24,7 +24,7 @@ MISS, ACCEPTED_MISS = outcome(-3.0, 0.0, accepted=False), outcome(0.0, -9.0, acc
 ALL = [ACCEPTED_MISS, HIT, MISS, REFUSED_HIT]
 
 
-def test_directions_are_flattened_about_the_axis_that_the_camera_looks_along() -> None:
+def test_directions_are_flattened_about_the_axis_that_the_camera_points_along() -> None:
     places = start_places(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]]))
     np.testing.assert_allclose(places[:, 1], [0.0, np.sqrt(0.5), np.sqrt(0.5), 1.0])
     np.testing.assert_allclose(places[1:3, 0], [0.0, np.pi / 2])

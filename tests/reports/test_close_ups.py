@@ -20,7 +20,7 @@ TURN = np.array([0.0, radians(0.5), 0.0, 0.0, 0.0, 0.0])
 SIGMA = np.array([radians(0.02), radians(0.03), radians(0.04), np.nan, np.nan, np.nan])
 
 
-def _said(window: Window, T_before: Matrix4, T_after: Matrix4, caption: Caption) -> list[str]:
+def _reported(window: Window, T_before: Matrix4, T_after: Matrix4, caption: Caption) -> list[str]:
     images = GreyImages(LimitsConfig())
     telling = difference_regions(window, images, T_before, T_after, (80, 60), 3, compensated=True)
     shift = shift_px(window, T_before, T_after, compensated=True)
@@ -31,37 +31,37 @@ def _share_of(picture: np.ndarray, colour: tuple[int, int, int]) -> float:
     return float((np.abs(picture.astype(np.int64) - colour).max(axis=2) < 8).mean())
 
 
-def test_the_words_tell_time_difference_spread_and_network() -> None:
+def test_the_text_report_time_difference_spread_and_network() -> None:
     window = scenes.post_window((-8.0, 8.0))
     truth = window.T_camera_lidar_start
     moved = se3.perturb(truth, TURN)
-    lines = _said(window, moved, truth, Caption("start", "accepted", SIGMA, "tiny.onnx"))
+    lines = _reported(window, moved, truth, Caption("start", "accepted", SIGMA, "tiny.onnx"))
     assert lines[0].startswith("front, 2020-09-13 12:26:40.123Z: start and accepted are 0.50° and 0.0 cm apart")
     assert lines[1] == "accepted − start: pitch +0.00 ± 0.02°, yaw −0.50 ± 0.03°, roll +0.00 ± 0.04°"
     assert lines[2] == "depth network: tiny.onnx"
 
 
-def test_a_stamp_that_is_no_date_is_told_in_seconds() -> None:
+def test_a_stamp_that_is_no_date_is_reported_in_seconds() -> None:
     window = scenes.post_window((0.0,), stamp_ns=20_000_000_000)
     truth = window.T_camera_lidar_start
-    assert _said(window, se3.perturb(truth, TURN), truth, Caption())[0].startswith("front, 20.000 s:")
+    assert _reported(window, se3.perturb(truth, TURN), truth, Caption())[0].startswith("front, 20.000 s:")
 
 
-def test_equal_extrinsics_are_said_to_be_equal() -> None:
+def test_equal_extrinsics_are_reported_to_be_equal() -> None:
     window = scenes.post_window((0.0,))
     truth = window.T_camera_lidar_start
-    assert "no difference between before and after" in _said(window, truth, truth, Caption())[0]
+    assert "no difference between before and after" in _reported(window, truth, truth, Caption())[0]
     assert close_ups(window, truth, truth).shape[2] == 3
 
 
-def test_a_cloud_without_points_is_a_picture_with_words() -> None:
+def test_a_cloud_without_points_is_a_picture_with_text() -> None:
     window = scenes.post_window((0.0,))
     (pair,) = window.pairs
     empty = LidarFrame(pair.lidar.stamp_ns, "lidar", np.zeros((0, 3), np.float32))
     window = replace(window, pairs=(replace(pair, lidar=empty),))
     truth = window.T_camera_lidar_start
     moved = se3.perturb(truth, TURN)
-    lines = _said(window, moved, truth, Caption())
+    lines = _reported(window, moved, truth, Caption())
     assert "0.50°" in lines[0]
     assert "nothing to enlarge" in lines[-1]
     picture = close_ups(window, moved, truth)
@@ -69,16 +69,16 @@ def test_a_cloud_without_points_is_a_picture_with_words() -> None:
 
 
 @pytest.mark.parametrize("model", scenes.POST_LENSES)
-def test_outlines_are_found_through_every_camera(model: str) -> None:
+def test_outlines_are_detected_through_every_camera(model: str) -> None:
     window = scenes.post_window((-14.0, 10.0), scenes.POST_LENSES[model])
     truth = window.T_camera_lidar_start
-    before, after = _said(window, se3.perturb(truth, TURN), truth, Caption())[-1].split("shown: ")[1].split(", ")
-    before_sigma, after_sigma = (float(said.split()[1].replace("−", "-")) for said in (before, after))
+    before, after = _reported(window, se3.perturb(truth, TURN), truth, Caption())[-1].split("shown: ")[1].split(", ")
+    before_sigma, after_sigma = (float(reported.split()[1].replace("−", "-")) for reported in (before, after))
     assert before_sigma < 0.7 < 1.5 < after_sigma
 
 
 @pytest.mark.parametrize("model", ["pinhole", "double_sphere"])
-def test_each_extrinsic_is_drawn_in_its_colour_on_its_side(model: str) -> None:
+def test_each_extrinsic_is_rendered_in_its_colour_on_its_side(model: str) -> None:
     window = scenes.post_window((-14.0, 10.0), scenes.POST_LENSES[model])
     truth = window.T_camera_lidar_start
     picture = close_ups(window, se3.perturb(truth, TURN), truth)

@@ -34,7 +34,7 @@ def test_a_figure_without_a_limit_keeps_none(
 
 
 @pytest.mark.fault("a text from a vehicle with control sequences for a terminal", "they are shown as escapes")
-def test_what_came_over_a_network_moves_no_cursor(capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_arrived_over_a_network_moves_no_cursor(capsys: pytest.CaptureFixture[str]) -> None:
     evil = "a\x1b[2J\x07b [red]c[/red]\r"
     console.show(evil)
     console.say(evil)
@@ -71,7 +71,7 @@ def test_whatever_rich_is_given_it_sends_a_terminal_its_own_sequences_only(capsy
     assert "[red]" in written, "markup is text"
 
 
-def test_markup_in_the_words_of_a_bar_is_text() -> None:
+def test_markup_in_the_text_of_a_bar_is_text() -> None:
     bars = Bars(terminal(), console.say, counted=False)
     task = bars.add_task("[red]front[/red]\n", note="[link=x]y")
     (shown,) = [PlainColumn("{task.description}").render(one) for one in bars.tasks if one.id == task]
@@ -91,11 +91,11 @@ def test_what_the_interpreter_prints_by_itself_is_escaped() -> None:
         "logging.getLogger('x').warning(evil)\n"
         "fail()\n"
     )
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, encoding="utf-8")
-    assert ended.returncode == 1
-    assert ended.stderr.count(r"ValueError: \x1b[35;45m\x9b\r") == 2
-    assert ended.stderr.count(r"\x1b[35;45m\x9b\r") == 3
-    assert obeyed_characters(ended.stderr) == ""
+    finished = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, encoding="utf-8")
+    assert finished.returncode == 1
+    assert finished.stderr.count(r"ValueError: \x1b[35;45m\x9b\r") == 2
+    assert finished.stderr.count(r"\x1b[35;45m\x9b\r") == 3
+    assert obeyed_characters(finished.stderr) == ""
     assert logging.lastResort is not None
 
 
@@ -119,7 +119,7 @@ HARMLESS = {"isatty", "encoding"}
 DISPLAYS = {"Live", "Progress"}
 """Displays of rich that make a console of their own unless they are given one."""
 
-LAST_WORDS = {name.rpartition(".")[2] for name in PRINTS | DISPLAYS}
+LAST_TEXT = {name.rpartition(".")[2] for name in PRINTS | DISPLAYS}
 STREAM_NAMES = {name.rpartition(".")[2] for name in STREAMS}
 
 
@@ -128,32 +128,32 @@ def bypasses(path: Path) -> list[str]:
     text = path.read_text()
     nodes = list(ast.walk(ast.parse(text)))
     harmless = {id(node.value) for node in nodes if isinstance(node, ast.Attribute) and node.attr in HARMLESS}
-    found = []
+    result = []
     for node in nodes:
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name | ast.Attribute):
-            if (node.func.id if isinstance(node.func, ast.Name) else node.func.attr) not in LAST_WORDS:
+            if (node.func.id if isinstance(node.func, ast.Name) else node.func.attr) not in LAST_TEXT:
                 continue
             name, given = ast.unparse(node.func), {keyword.arg for keyword in node.keywords}
             alone = name in DISPLAYS and "from rich" in text and "console" not in given
             if name in PRINTS or alone:
-                found.append((node.lineno, name))
+                result.append((node.lineno, name))
         elif (
             isinstance(node, ast.Attribute)
             and node.attr in STREAM_NAMES
             and isinstance(node.ctx, ast.Load)
             and id(node) not in harmless
         ):
-            found += [(node.lineno, stream) for stream in STREAMS & {ast.unparse(node)}]
-    return [f"{path.relative_to(PACKAGE.parent)}:{line}: {name}" for line, name in found]
+            result += [(node.lineno, stream) for stream in STREAMS & {ast.unparse(node)}]
+    return [f"{path.relative_to(PACKAGE.parent)}:{line}: {name}" for line, name in result]
 
 
 def test_nothing_prints_but_through_the_one_place_that_escapes() -> None:
     modules = {*PACKAGE.rglob("*.py"), *(PACKAGE.parent / "coec_lab").rglob("*.py")}
     assert modules > SINKS
-    assert [found for path in sorted(modules - SINKS) for found in bypasses(path)] == []
+    assert [result for path in sorted(modules - SINKS) for result in bypasses(path)] == []
 
 
-def test_a_module_that_prints_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_module_that_prints_is_detected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.modules[__name__], "PACKAGE", tmp_path / "coec")
     path = tmp_path / "m.py"
     path.write_text("from rich.live import Live\nimport sys\nout = sys.stderr\nprint(1)\nLive()\nsys.stdout.isatty()\n")

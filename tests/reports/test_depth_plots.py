@@ -38,7 +38,7 @@ def test_curves_without_a_peak() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 200])
-def test_wide_frames_stand_above_their_map_others_beside_it(count: int) -> None:
+def test_wide_frames_stand_above_their_map_others_next_to_it(count: int) -> None:
     values = np.linspace(0, 1, 12, dtype=np.float32).reshape(3, 4)
     values[0, 0] = np.nan
     wide = _size(plots.frame(np.full((30, 90, 3), 90, np.uint8), values, _pairing(count), "title"))

@@ -32,11 +32,11 @@ RIGHT = Observation(
 
 def test_a_mount_that_moved_is_named_by_its_axes_farthest_first() -> None:
     off = (-1.0, 0.4, 0.1, 0.0, -0.2, 0.0)
-    found = diagnosis.finding_of(replace(RIGHT, flagged=True), off, SIGMA)
-    assert found.state == "moved"
-    assert found.sentence == "mount moved: pitch −1.0° ± 0.12°, down −0.20 m ± 0.03 m, yaw +0.4° ± 0.12°"
-    assert any("coec calibrate" in remark for remark in found.remarks)
-    assert any("camera or the LiDAR" in remark for remark in found.remarks)
+    result = diagnosis.finding_of(replace(RIGHT, flagged=True), off, SIGMA)
+    assert result.state == "moved"
+    assert result.sentence == "mount moved: pitch −1.0° ± 0.12°, down −0.20 m ± 0.03 m, yaw +0.4° ± 0.12°"
+    assert any("coec calibrate" in comment for comment in result.remarks)
+    assert any("camera or the LiDAR" in comment for comment in result.remarks)
 
 
 def test_where_no_axis_is_beyond_chance_the_farthest_is_named() -> None:
@@ -45,23 +45,23 @@ def test_where_no_axis_is_beyond_chance_the_farthest_is_named() -> None:
 
 def test_wrong_data_accuse_no_mount() -> None:
     cause = Cause("image_frozen", "every picture is the same.", "Look at the camera.")
-    found = diagnosis.finding_of(replace(RIGHT, flagged=True, causes=(cause,)), (9.0,) * 6, SIGMA)
-    assert found.state == "bad_data"
-    assert "mount moved" not in found.sentence
-    assert found.remarks[0] == "image_frozen: every picture is the same."
+    result = diagnosis.finding_of(replace(RIGHT, flagged=True, causes=(cause,)), (9.0,) * 6, SIGMA)
+    assert result.state == "bad_data"
+    assert "mount moved" not in result.sentence
+    assert result.remarks[0] == "image_frozen: every picture is the same."
 
 
-def test_what_cannot_be_told_says_so() -> None:
-    found = diagnosis.finding_of(replace(RIGHT, undecided=True), (0.5, 0.0, 0.0, 0.0, 0.0, 0.0), SIGMA)
-    assert found.state == "unclear"
-    assert "cannot tell" in found.sentence
-    assert "pitch +0.5°" in found.sentence
+def test_what_cannot_be_determined_is_reported() -> None:
+    result = diagnosis.finding_of(replace(RIGHT, undecided=True), (0.5, 0.0, 0.0, 0.0, 0.0, 0.0), SIGMA)
+    assert result.state == "unclear"
+    assert "cannot tell" in result.sentence
+    assert "pitch +0.5°" in result.sentence
 
 
 def test_a_right_one_says_what_would_not_be_seen(capsys: pytest.CaptureFixture[str]) -> None:
-    found = diagnosis.finding_of(replace(RIGHT, weak=True), NOWHERE, SIGMA)
-    assert found.state == "right"
-    diagnosis.show(found)
+    result = diagnosis.finding_of(replace(RIGHT, weak=True), NOWHERE, SIGMA)
+    assert result.state == "right"
+    diagnosis.show(result)
     shown = capsys.readouterr().out
     assert "less than 0.39°" in shown
     assert "faint" in shown
@@ -74,20 +74,20 @@ OFF = (-0.7, 0.0, 0.1, 0.0, 0.0, 0.0)
 
 
 def test_what_a_solve_has_measured_comes_before_the_nearest_place_that_a_check_finds() -> None:
-    found = diagnosis.finding_of(replace(RIGHT, flagged=True), OFF, SIGMA, MEASURED)
-    assert found.sentence == "mount moved: pitch −1.02° ± 0.05°"
-    assert any("all 25 pairs" in remark for remark in found.remarks)
-    assert any("Only turns were searched" in remark for remark in found.remarks)
+    result = diagnosis.finding_of(replace(RIGHT, flagged=True), OFF, SIGMA, MEASURED)
+    assert result.sentence == "mount moved: pitch −1.02° ± 0.05°"
+    assert any("all 25 pairs" in comment for comment in result.remarks)
+    assert any("Only turns were searched" in comment for comment in result.remarks)
     shifted = replace(MEASURED, sigma=(0.05, 0.04, 0.06, 0.01, 0.01, 0.01))
-    found = diagnosis.finding_of(replace(RIGHT, flagged=True), OFF, SIGMA, shifted)
-    assert not any("Only turns" in remark for remark in found.remarks)
-    assert not any("nearest place" in remark for remark in found.remarks)
+    result = diagnosis.finding_of(replace(RIGHT, flagged=True), OFF, SIGMA, shifted)
+    assert not any("Only turns" in comment for comment in result.remarks)
+    assert not any("nearest place" in comment for comment in result.remarks)
 
 
 def test_of_a_mount_whose_solve_is_refused_no_sigma_is_claimed() -> None:
     refused = replace(MEASURED, accepted=False, reasons=("The runner-up is as good",))
-    found = diagnosis.finding_of(replace(RIGHT, flagged=True), OFF, SIGMA, refused)
-    assert found.state == "moved"
-    assert found.sentence.endswith("the nearest place at which the edges fit is pitch −0.7°")
-    assert "±" not in found.sentence
-    assert any("The runner-up is as good" in remark for remark in found.remarks)
+    result = diagnosis.finding_of(replace(RIGHT, flagged=True), OFF, SIGMA, refused)
+    assert result.state == "moved"
+    assert result.sentence.endswith("the nearest place at which the edges fit is pitch −0.7°")
+    assert "±" not in result.sentence
+    assert any("The runner-up is as good" in comment for comment in result.remarks)

@@ -13,7 +13,7 @@ OFF = (-0.8, 0.6, -0.5, 0.0, 0.0, 0.0)
 """As the workshop's calibration of the tutorial's drive is off, deg and m."""
 
 
-def test_where_all_searches_meet_beside_the_reference_it_is_doubted(capsys: pytest.CaptureFixture[str]) -> None:
+def test_where_all_searches_meet_next_to_the_reference_it_is_doubted(capsys: pytest.CaptureFixture[str]) -> None:
     report = evaluation_report(accepted_misses=5).model_copy(update={"median": OFF, "from_reference": OFF})
     doubt = reference_doubt(report)
     assert doubt is not None
@@ -25,7 +25,7 @@ def test_where_all_searches_meet_beside_the_reference_it_is_doubted(capsys: pyte
     assert "either that calibration is off" in page
 
 
-def test_searches_that_end_at_the_reference_or_apart_doubt_nothing() -> None:
+def test_searches_that_end_at_the_reference_or_separate_doubt_nothing() -> None:
     home = (0.1, 0.0, 0.1, 0.0, 0.0, 0.0)
     for median, from_reference in ((home, home), (OFF, home), (home, OFF), ((3.0, 0.0, 0.0, 0.0, 0.0, 0.0), OFF)):
         report = evaluation_report(accepted_misses=5).model_copy(

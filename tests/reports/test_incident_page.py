@@ -57,26 +57,26 @@ EVENT = EvidenceEvent(
 STORY = FetchedIncident(EVENT, None, None, None, None, (), (), None)
 
 
-def told(story: FetchedIncident, pictures: Mapping[str, bytes] = MappingProxyType({})) -> str:
+def reported(story: FetchedIncident, pictures: Mapping[str, bytes] = MappingProxyType({})) -> str:
     """The document."""
     return render(page(story, pictures, MADE))
 
 
 def test_the_story_is_what_the_documents_say() -> None:
-    said = " ".join(sentences(STORY))
-    assert "At 100.000 s of sensor time the pair front of truck turned red" in said
-    assert "The mount is bent. (bent_mount)" in said
-    assert "The window before it is front-7; nothing is told of what was decided of it." in said
-    assert "There is no window after it." in said
-    assert "It had not ended when this was fetched." in said
+    message = " ".join(sentences(STORY))
+    assert "At 100.000 s of sensor time the pair front of truck turned red" in message
+    assert "The mount is bent. (bent_mount)" in message
+    assert "The window before it is front-7; nothing is told of what was decided of it." in message
+    assert "There is no window after it." in message
+    assert "It had not ended when this was fetched." in message
     resolved = replace(
         STORY, event=EVENT.model_copy(update={"resolved_stamp_ns": 160 * S, "resolution": "healthy: ok"})
     )
     assert "It ended after 60 s: healthy: ok" in " ".join(sentences(resolved))
 
 
-def test_figures_are_drawn_on_one_axis_of_time_with_the_event_in_it() -> None:
-    text = told(STORY, {"before.jpg": png()})
+def test_figures_are_rendered_on_one_axis_of_time_with_the_event_in_it() -> None:
+    text = reported(STORY, {"before.jpg": png()})
     (line,) = re.findall(r'<path class="line [^"]*" d="(M[^"]*L[^"]*)"', text)
     assert len(re.findall("[ML]", line)) == len(EVENT.metrics), "a figure that was not told is not drawn"
     assert re.findall(r'<rect class="ground (\w+)" x=', text) == ["good", "unsure"], "each state once"
@@ -101,7 +101,7 @@ def test_what_a_vehicle_says_is_text() -> None:
         vehicle="v", pair="p", total=0, results=(), entries=(ChainedEntry(sha256=EVIL, entry=entry),)
     )
     story = FetchedIncident(event, history, None, None, None, (), (Absent(what=EVIL, why=EVIL),), False)
-    text = told(story)
+    text = reported(story)
     assert text.count("<script") == 1, "that of the page itself"
     assert "<img" not in text
     assert "something was changed, taken out or put in" in text
@@ -124,7 +124,7 @@ def test_no_text_of_any_document_adds_to_the_page_or_reverses_it() -> None:
             chain_holds=True,
             snippets=(text,),
         )
-        return told(story, {"before.jpg": png()})
+        return reported(story, {"before.jpg": png()})
 
     shown = of(HOSTILE)
     assert obeyed_characters(shown) == ""
@@ -167,6 +167,6 @@ def test_entries_are_held_against_their_hashes() -> None:
 
 
 def test_snippets_are_links_into_the_folder() -> None:
-    text = told(replace(STORY, snippets=("front-7.snippet", "<b>")))
+    text = reported(replace(STORY, snippets=("front-7.snippet", "<b>")))
     assert 'href="windows/front-7.snippet.mcap"' in text
     assert "<b>" not in text

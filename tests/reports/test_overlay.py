@@ -14,7 +14,7 @@ CAMERA = build("pinhole", width=WIDTH, height=HEIGHT, fx=400.0, fy=400.0, cx=480
 T_CAMERA_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
-def _drawn(
+def _rendered(
     *points: tuple[float, float, float], mask: np.ndarray | None = None, scale: RangeScale | None = WHOLE_SCALE
 ) -> np.ndarray:
     """The picture without its bar, on black."""
@@ -26,7 +26,7 @@ def _drawn(
 
 def test_a_point_lands_where_the_camera_sees_it() -> None:
     # 10 m ahead, 1 m to the left, 0.5 m up: u = 480 - 40, v = 270 - 20.
-    rows, columns = np.nonzero(_drawn((10.0, 1.0, 0.5)).any(axis=2))
+    rows, columns = np.nonzero(_rendered((10.0, 1.0, 0.5)).any(axis=2))
     assert rows.mean() == pytest.approx(250.0)
     assert columns.mean() == pytest.approx(440.0)
     assert len(rows) < 12
@@ -34,26 +34,26 @@ def test_a_point_lands_where_the_camera_sees_it() -> None:
 
 def test_the_nearer_of_two_points_is_on_top_whatever_their_order() -> None:
     near, far = (5.0, 0.0, 0.0), (50.0, 0.0, 0.0)
-    np.testing.assert_array_equal(_drawn(near, far), _drawn(far, near))
-    np.testing.assert_array_equal(_drawn(near, far), _drawn(near))
-    assert (_drawn(near)[270, 480] != _drawn(far)[270, 480]).any()
+    np.testing.assert_array_equal(_rendered(near, far), _rendered(far, near))
+    np.testing.assert_array_equal(_rendered(near, far), _rendered(near))
+    assert (_rendered(near)[270, 480] != _rendered(far)[270, 480]).any()
 
 
 def test_near_is_yellow_and_far_is_violet() -> None:
-    near, far = _drawn((2.5, 0, 0))[270, 480].astype(int), _drawn((79.0, 0, 0))[270, 480].astype(int)
+    near, far = _rendered((2.5, 0, 0))[270, 480].astype(int), _rendered((79.0, 0, 0))[270, 480].astype(int)
     assert min(near[1], near[2]) > near[0]
     assert far[0] > far[2] > far[1]
 
 
-def test_colours_follow_the_ranges_in_view_and_not_those_outside() -> None:
+def test_colours_follow_the_ranges_in_view_and_not_those_beyond() -> None:
     """What is 10 m away is far in a room, and near on a square; what is behind the camera is not in the picture."""
     room = [(x, -0.5, 0.1) for x in np.linspace(3.0, 10.0, 200)]
     square = [(x, -0.5, 0.1) for x in np.linspace(10.0, 75.0, 200)]
     seen = (10.0, 1.0, 0.5)
-    in_room, on_square = _drawn(seen, *room, scale=None), _drawn(seen, *square, scale=None)
+    in_room, on_square = _rendered(seen, *room, scale=None), _rendered(seen, *square, scale=None)
     assert in_room[250, 440, 2] < 150 < on_square[250, 440, 2]
     behind = [(-x, 0.0, 0.0) for x in np.linspace(20.0, 75.0, 400)]
-    np.testing.assert_array_equal(_drawn(seen, *room, *behind, scale=None), in_room)
+    np.testing.assert_array_equal(_rendered(seen, *room, *behind, scale=None), in_room)
 
 
 def test_a_title_of_two_lines_is_higher_and_a_long_one_no_wider() -> None:
@@ -64,19 +64,19 @@ def test_a_title_of_two_lines_is_higher_and_a_long_one_no_wider() -> None:
     assert one.shape[1] == two.shape[1] == WIDTH
 
 
-def test_points_behind_outside_and_masked_are_left_out() -> None:
-    assert not _drawn((-10.0, 0, 0)).any()
-    assert not _drawn((1.9, 0, 0)).any()
-    assert not _drawn((10.0, 50.0, 0)).any()
+def test_points_behind_beyond_and_masked_are_left_out() -> None:
+    assert not _rendered((-10.0, 0, 0)).any()
+    assert not _rendered((1.9, 0, 0)).any()
+    assert not _rendered((10.0, 50.0, 0)).any()
     mask = np.ones((HEIGHT, WIDTH), np.bool_)
     mask[:, 470:490] = False
-    assert not _drawn((10.0, 0, 0), mask=mask).any()
-    assert _drawn((10.0, 1, 0), mask=mask).any()
+    assert not _rendered((10.0, 0, 0), mask=mask).any()
+    assert _rendered((10.0, 1, 0), mask=mask).any()
 
 
 def test_a_point_on_the_edge_is_cut_off() -> None:
     # u = 480 - 400 · 12 / 10 = 0.
-    assert _drawn((10.0, 12.0, 0))[270, 0].any()
+    assert _rendered((10.0, 12.0, 0))[270, 0].any()
 
 
 def test_small_images_are_enlarged() -> None:
@@ -91,7 +91,7 @@ def test_small_images_are_enlarged() -> None:
     "it is drawn in escapes, and cut off",
 )
 @pytest.mark.parametrize("name", ["\udc80", "a\x1b[31m\x00\n", "\u202e", 100_000 * "x", ""])
-def test_any_name_can_be_drawn(name: str) -> None:
+def test_any_name_can_be_rendered(name: str) -> None:
     picture = titled(np.zeros((HEIGHT, WIDTH, 3), np.uint8), name)
     assert picture.shape == (picture.shape[0], WIDTH, 3)
     assert (picture[:20] < 128).any() == bool(name)

@@ -74,9 +74,9 @@ def test_titles_that_are_alike_or_empty_have_places_of_their_own() -> None:
 
 def test_code_in_sentences_stands_between_backticks() -> None:
     def shown(text: str) -> str:
-        found = re.search(r'<p class="text">(.*)</p>', render(Page("kind", "title", (Text((text,)),), ())))
-        assert found is not None
-        return found[1]
+        result = re.search(r'<p class="text">(.*)</p>', render(Page("kind", "title", (Text((text,)),), ())))
+        assert result is not None
+        return result[1]
 
     assert shown("run `coec <x>` now") == "run <code>coec &lt;x&gt;</code> now"
     assert shown("one ` alone <b>") == "one ` alone &lt;b&gt;"
@@ -107,10 +107,10 @@ def test_what_is_no_picture_is_refused() -> None:
 @given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6), st.integers(3, 10))
 def test_ticks_are_round_within_and_not_too_many(low: float, length: float, most: int) -> None:
     high = low + length
-    found = charts.linear_ticks(low, high, most)
-    assert 1 <= len(found) <= most
-    assert all(low - 1e-6 * length <= tick <= high + 1e-6 * length for tick in found)
-    assert found == sorted(set(found))
+    result = charts.linear_ticks(low, high, most)
+    assert 1 <= len(result) <= most
+    assert all(low - 1e-6 * length <= tick <= high + 1e-6 * length for tick in result)
+    assert result == sorted(set(result))
 
 
 def test_logarithmic_ticks_are_of_one_two_three_and_five() -> None:
@@ -124,14 +124,14 @@ def test_logarithmic_ticks_are_of_one_two_three_and_five() -> None:
 def test_a_plot_of_whatever_lies_within_its_axes(points: list[tuple[float, float]], log: bool) -> None:
     chart = Chart("t", "x", "y", (Series("s", points),), "told", marks=(Mark(0.5, "a mark with a name"),), log_y=log)
     for size in (charts.WIDE, charts.NARROW, charts.SMALL):
-        drawn = charts.layout(chart, size)
-        assert 0 < drawn.left < drawn.right <= size.width
-        assert 0 < drawn.top < drawn.bottom <= size.height
-        for path in drawn.paths:
+        rendered = charts.layout(chart, size)
+        assert 0 < rendered.left < rendered.right <= size.width
+        assert 0 < rendered.top < rendered.bottom <= size.height
+        for path in rendered.paths:
             for x, y in re.findall(r"[ML]([-\d.]+) ([-\d.]+)", path.d):
-                assert drawn.left <= float(x) <= drawn.right
-                assert drawn.top <= float(y) <= drawn.bottom
-        assert all(isfinite(tick.at) for tick in (*drawn.x_ticks, *drawn.y_ticks))
+                assert rendered.left <= float(x) <= rendered.right
+                assert rendered.top <= float(y) <= rendered.bottom
+        assert all(isfinite(tick.at) for tick in (*rendered.x_ticks, *rendered.y_ticks))
 
 
 def test_a_line_is_broken_where_there_is_no_value_and_steps_hold() -> None:
@@ -146,16 +146,16 @@ def test_names_of_marks_do_not_run_into_each_other() -> None:
     marks = tuple(Mark(at, "a long name") for at in (40.0, 41.0, 60.0, 99.0))
     chart = Chart("t", "x", "y", (Series("s", [(0.0, 0.0), (100.0, 1.0)]),), "", marks=marks)
     for size in (charts.WIDE, charts.NARROW):
-        drawn = charts.layout(chart, size)
+        rendered = charts.layout(chart, size)
         reach = charts.LETTER_PX * len("a long name")
         spans = [
             (line.row_y, line.at if line.anchor == "start" else line.at - reach)
-            for line in sorted(drawn.marks, key=str)
+            for line in sorted(rendered.marks, key=str)
         ]
         for row, begin in spans:
             others = [other for other_row, other in spans if other_row == row and other != begin]
             assert all(abs(begin - other) >= reach for other in others)
-        assert all(line.row_y < drawn.top for line in drawn.marks)
+        assert all(line.row_y < rendered.top for line in rendered.marks)
         assert all(begin >= 0 and begin + reach <= size.width for _, begin in spans)
 
 
@@ -166,7 +166,7 @@ def test_a_legend_names_everything_once() -> None:
 
 
 @pytest.mark.parametrize(
-    ("shown", "wanted"),
+    ("shown", "expected"),
     [
         (number(-0.0004), "0.000"),
         (number(-1.5, 1, sign=True), "−1.5"),
@@ -180,8 +180,8 @@ def test_a_legend_names_everything_once() -> None:
         (percent(0.5), "50.0\N{NARROW NO-BREAK SPACE}%"),
     ],
 )
-def test_numbers_as_they_are_shown(shown: str, wanted: str) -> None:
-    assert shown == wanted
+def test_numbers_as_they_are_shown(shown: str, expected: str) -> None:
+    assert shown == expected
 
 
 def test_figures_that_fail_come_first_with_what_to_do() -> None:
@@ -204,7 +204,7 @@ def test_figures_that_fail_come_first_with_what_to_do() -> None:
     assert under < 0.5 < over
 
 
-def test_every_picture_has_words() -> None:
+def test_every_picture_has_text() -> None:
     assert all(alt and caption.endswith(".") for alt, caption in CAPTIONS.values())
 
 

@@ -25,7 +25,7 @@ BAR_PX = 15
 
 MOST_BYTES = 3_000_000
 
-LOOK = """() => ({
+OBSERVATION = """() => ({
     wide: document.scrollingElement.scrollWidth, room: document.documentElement.clientWidth, inner: innerWidth,
     headings: [...document.querySelectorAll("h1,h2,h3,h4")].map(h => Number(h.tagName[1])),
     unnamed: [...document.querySelectorAll("img")].filter(i => !i.alt || !i.complete || !i.naturalWidth).length,
@@ -89,7 +89,7 @@ def test_a_page_fits_every_screen_and_loads_nothing(browser: Browser, tmp_path: 
         tab.set_viewport_size({"width": width, "height": 900})
         bar = tab.add_style_tag(content=f"html::-webkit-scrollbar {{ width: {BAR_PX if width > PHONE_PX else 0}px }}")
         tab.evaluate(SETTLED)
-        seen = tab.evaluate(LOOK)
+        seen = tab.evaluate(OBSERVATION)
         bar.evaluate("tag => tag.remove()")
         assert seen["inner"] == width
         assert seen["wide"] <= seen["room"], "beside the scroll bar"
@@ -138,16 +138,16 @@ def test_buttons_work_without_permission(browser: Browser, tmp_path: Path, refus
         refuses,
     )
     button = tab.locator("button[data-copy]").first
-    wanted = button.get_attribute("data-copy")
+    expected = button.get_attribute("data-copy")
     button.click()
     if refuses:
         tab.get_by_text("copy it with Ctrl+C").wait_for()
         area = tab.locator("textarea")
         assert area.is_visible()
-        assert area.evaluate("a => a.value.slice(a.selectionStart, a.selectionEnd)") == wanted
+        assert area.evaluate("a => a.value.slice(a.selectionStart, a.selectionEnd)") == expected
     else:
         tab.get_by_text("Copied.").wait_for()
-        assert tab.evaluate("window.taken") == wanted
+        assert tab.evaluate("window.taken") == expected
         assert tab.locator("textarea").count() == 0
     assert wrong == []
     tab.context.close()
@@ -173,7 +173,7 @@ def test_the_slider_moves_between_both_pictures_by_the_keyboard(browser: Browser
     tab.context.close()
 
 
-def test_a_page_is_dark_where_that_is_asked_for(browser: Browser, tmp_path: Path) -> None:
+def test_a_page_is_dark_where_that_is_requested(browser: Browser, tmp_path: Path) -> None:
     path = page.write(tmp_path / "report.html", pages.calibration(tmp_path))
     light_of = "getComputedStyle(document.body).{}.match(/\\d+/g).slice(0, 3).reduce((a, b) => a + Number(b), 0) / 765"
     tab, _ = opened(browser, path)

@@ -20,17 +20,17 @@ WINDOW = scenes.post_window((-8.0, 8.0))
 WINDOW = replace(WINDOW, pairs=WINDOW.pairs * 4)
 
 
-def drawn(folder: Path, looks: float | None) -> Comparison:
+def rendered(folder: Path, observations: float | None) -> Comparison:
     truth = WINDOW.T_camera_lidar_start
     moved = se3.perturb(truth, np.array([0.0, radians(0.5), 0.0, 0.0, 0.0, 0.0]))
-    return write_comparison(folder, WINDOW, moved, truth, Caption("start", "result"), True, looks)
+    return write_comparison(folder, WINDOW, moved, truth, Caption("start", "result"), True, observations)
 
 
-@pytest.mark.parametrize("looks", [None, 4.0, 2.0])
-def test_a_map_of_residuals_is_drawn_where_the_pairs_tell_of_several_scenes(
-    tmp_path: Path, looks: float | None
+@pytest.mark.parametrize("observations", [None, 4.0, 2.0])
+def test_a_map_of_residuals_is_rendered_where_the_pairs_determine_of_several_scenes(
+    tmp_path: Path, observations: float | None
 ) -> None:
-    comparison = drawn(tmp_path, looks)
+    comparison = rendered(tmp_path, observations)
     assert [path.name for path in comparison.files] == [
         "overlay_before.png", "overlay_after.png", "close_ups.png", "residuals.png"
     ]  # fmt: skip
@@ -39,15 +39,15 @@ def test_a_map_of_residuals_is_drawn_where_the_pairs_tell_of_several_scenes(
 
 
 def test_it_is_left_out_with_the_reason_where_they_show_one_again_and_again(tmp_path: Path) -> None:
-    comparison = drawn(tmp_path, 1.3)
+    comparison = rendered(tmp_path, 1.3)
     assert not (tmp_path / "residuals.png").exists()
     (why,) = comparison.left_out
     assert "4 pairs that are worth 1.3 independent looks" in why
     assert Text((why,), quiet=True) in comparison.blocks
 
 
-def test_what_a_slider_moves_over_has_no_words_in_it(tmp_path: Path) -> None:
-    comparison = drawn(tmp_path, None)
+def test_what_a_slider_moves_over_has_no_text_in_it(tmp_path: Path) -> None:
+    comparison = rendered(tmp_path, None)
     slid, near = comparison.blocks
     assert isinstance(slid, Compare)
     assert isinstance(near, Pictures)

@@ -24,7 +24,7 @@ from coec.reports.residual_map import (
 from support import scenes
 
 
-def test_the_words_tell_what_all_parts_have_in_common() -> None:
+def test_the_text_report_what_all_parts_have_in_common() -> None:
     window = scenes.post_window(tuple(np.arange(-36.0, 37.0, 4.0).tolist()))
     window = replace(window, pairs=window.pairs * 4)
     moved = se3.perturb(window.T_camera_lidar_start, np.array([0, radians(0.5), 0, 0, 0, 0]))
@@ -38,7 +38,7 @@ def test_the_words_tell_what_all_parts_have_in_common() -> None:
     assert right_px == pytest.approx(-400.0 * np.tan(radians(0.5)), abs=1.0)
 
 
-def test_a_picture_without_a_range_edge_says_that_nothing_is_told() -> None:
+def test_a_picture_without_a_range_edge_reports_that_nothing_is_reported() -> None:
     window = scenes.post_window((0.0,))
     (pair,) = window.pairs
     empty = LidarFrame(0, "lidar", np.zeros((0, 3), np.float32))
@@ -57,20 +57,20 @@ def test_an_exact_fit_leaves_nothing_and_another_what_the_fit_says() -> None:
     fit = fit_double_sphere(fisheye)
     cells = (np.arange(64) + 0.5) / 64  # as the fit compares them
     u, v = np.meshgrid(640 * cells - 0.5, 360 * cells - 0.5)
-    apart = residuals_px(fisheye, fit.camera, np.column_stack([u.ravel(), v.ravel()]))
-    size = np.linalg.norm(apart, axis=1)
+    separation = residuals_px(fisheye, fit.camera, np.column_stack([u.ravel(), v.ravel()]))
+    size = np.linalg.norm(separation, axis=1)
     assert np.sqrt((size**2).mean()) == pytest.approx(fit.residual_rms_px, rel=1e-6)
     assert 0.5 * fit.residual_max_px < size.max() <= fit.residual_max_px
-    said = f"{fit.residual_rms_px:.3g} px rms, {fit.residual_max_px:.3g} px at most"
-    assert said in lens_sentences(fisheye, fit.camera, size)[0]
+    reported = f"{fit.residual_rms_px:.3g} px rms, {fit.residual_max_px:.3g} px at most"
+    assert reported in lens_sentences(fisheye, fit.camera, size)[0]
     picture = lens_residual(fisheye, fit.camera)
     assert picture.shape[2] == 3
     assert (picture[:4] == 255).all()
 
 
-def test_where_one_has_no_pixel_nothing_is_told() -> None:
+def test_where_one_has_no_pixel_nothing_is_reported() -> None:
     wide, narrow = scenes.POST_LENSES["double_sphere"], scenes.POST_LENSES["mei"]
     corner = np.array([[-5000.0, -5000.0], [320.0, 180.0]])
-    apart = residuals_px(narrow, wide, corner)
-    assert np.isnan(apart[0]).all()
-    assert np.isfinite(apart[1]).all()
+    separation = residuals_px(narrow, wide, corner)
+    assert np.isnan(separation[0]).all()
+    assert np.isfinite(separation[1]).all()

@@ -48,7 +48,7 @@ def test_who_moved_is_marked_in_red_where_it_sits() -> None:
     assert left_x < front_x  # further left is further left
 
 
-def test_an_edge_is_red_when_it_is_sure_and_not_when_it_cannot_tell() -> None:
+def test_an_edge_is_red_when_it_is_sure_and_not_when_it_cannot_decide() -> None:
     def red(edge: PlottedEdge) -> int:
         return int(strong(pixels(FRONT, LEFT, ROOF, edges=(edge, EDGES[1])), 2).sum())
 
@@ -58,7 +58,7 @@ def test_an_edge_is_red_when_it_is_sure_and_not_when_it_cannot_tell() -> None:
         assert nothing.sigmas == 0.0
 
 
-def test_words_tell_state_size_and_probability_and_never_certainty() -> None:
+def test_text_report_state_size_and_probability_and_never_certainty() -> None:
     moved = PlottedSensor("roof", "lidar", placed(1.0, 0.0), 360.0, "lidar_moved", 1.0, 1.04)
     assert label_of(moved).splitlines() == ["roof", "moved by 1°", "> 99 %"]
     assert label_of(replace(moved, state="undecided", probability=0.42)).splitlines() == ["roof", "undecided", "42 %"]

@@ -24,7 +24,7 @@ def test_every_state_has_its_ground() -> None:
     assert ground_red > max(blue, green)
 
 
-def test_equal_drives_give_equal_bytes_and_marks_are_drawn() -> None:
+def test_equal_drives_give_equal_bytes_and_marks_are_rendered() -> None:
     marks = [(18.0, "knock")]
     assert timeline(SERIES, marks, 0.3, "title") == timeline(SERIES, marks, 0.3, "title")
     assert not np.array_equal(picture(SERIES, marks), picture(SERIES, []))

@@ -90,7 +90,7 @@ def test_every_text_of_a_message_prints_as_an_escape_and_travels_as_it_is(model:
     assert obeyed_characters(f"{message_texts(message)}{message!r}") == ""
 
 
-def test_places_of_mistakes_name_no_key_of_the_sender_as_it_came() -> None:
+def test_places_of_mistakes_name_no_key_of_the_sender_as_it_arrived() -> None:
     document = json.loads(to_json(hostile_message(HealthReply)))
     document["metrics"] = {HOSTILE + "k" * 10_000: {}}
     with pytest.raises(DecodeError) as refused:

@@ -162,10 +162,10 @@ def test_claims_of_daemons_are_read_back_and_nothing_else_is() -> None:
             Keys("coec", "other").parse_claim(key)
 
 
-def test_an_extrinsic_is_asked_for_as_a_reply_or_as_a_file() -> None:
+def test_an_extrinsic_is_requested_as_a_reply_or_as_a_file() -> None:
     assert parse_extrinsic_selector("", ("urdf",)) == ExtrinsicSelector()
     assert parse_extrinsic_selector("format=json", ("urdf", "json")) == ExtrinsicSelector("json")
-    asked = parse_extrinsic_selector("format=urdf;parent=base_link", ("urdf", "json"))
-    assert asked == ExtrinsicSelector(export="urdf", parent="base_link")
+    requested = parse_extrinsic_selector("format=urdf;parent=base_link", ("urdf", "json"))
+    assert requested == ExtrinsicSelector(export="urdf", parent="base_link")
     with pytest.raises(UsageError, match="must be one of msgpack, json, urdf"):
         parse_extrinsic_selector("format=cuneiform", ("urdf", "json"))

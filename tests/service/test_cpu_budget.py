@@ -39,7 +39,7 @@ def budget(clock: Clock) -> Budget:
     return made
 
 
-def test_what_everything_would_take_is_told_with_what_it_stretches(budget: Budget, clock: Clock) -> None:
+def test_what_everything_would_take_is_reported_with_what_it_stretches(budget: Budget, clock: Clock) -> None:
     clock.now_s = 100.0
     for pair in ("front", "rear"):
         assert budget.try_acquire(pair, S, suspected=False)
@@ -50,17 +50,19 @@ def test_what_everything_would_take_is_told_with_what_it_stretches(budget: Budge
     budget.pay(Cost(worker_jobs.Kind.SOLVE, "front", 6.5))
     budget.pay(Cost(START, "", 3.5))
     clock.now_s = 103.0
-    told = budget_status_of(budget.report())
-    assert told.cores == 0.5
-    assert told.wanted == pytest.approx(2 * (2.0 / 5.0 + 9.0 / 180.0)), "what one window costs is expected of the other"
-    assert told.stretched_by == pytest.approx(told.wanted / 0.5, abs=0.05)
-    assert told.spent == pytest.approx(16.5 / 103.0)
-    assert told.in_store_s == pytest.approx(5.0 - 4.0)
-    assert told.spent_s == pytest.approx({"check": 4.0, "prefetch": 2.5, "solve": 6.5, "start": 3.5})
-    assert told.pairs["front"].window_s == pytest.approx(9.0)
-    assert told.pairs["rear"].window_s is None
-    assert told.pairs["rear"].unseen_s == pytest.approx(3.0)
-    status = status_reply(budget=told)
+    reported = budget_status_of(budget.report())
+    assert reported.cores == 0.5
+    assert reported.wanted == pytest.approx(2 * (2.0 / 5.0 + 9.0 / 180.0)), (
+        "what one window costs is expected of the other"
+    )
+    assert reported.stretched_by == pytest.approx(reported.wanted / 0.5, abs=0.05)
+    assert reported.spent == pytest.approx(16.5 / 103.0)
+    assert reported.in_store_s == pytest.approx(5.0 - 4.0)
+    assert reported.spent_s == pytest.approx({"check": 4.0, "prefetch": 2.5, "solve": 6.5, "start": 3.5})
+    assert reported.pairs["front"].window_s == pytest.approx(9.0)
+    assert reported.pairs["rear"].window_s is None
+    assert reported.pairs["rear"].unseen_s == pytest.approx(3.0)
+    status = status_reply(budget=reported)
     lines = metrics.render(MetricsInput(status, {})).decode().splitlines()
     assert 'coec_worker_processor_seconds_total{kind="solve"} 6.5' in lines
     assert "coec_budget_cores 0.5" in lines
@@ -77,7 +79,7 @@ def test_pictures_and_windows_of_earlier_runs_keep_nobody_waiting(budget: Budget
     assert sum(report.totals_s.values()) == 5000.0, "but they are told"
 
 
-def test_what_has_begun_counts_until_it_has_ended(budget: Budget) -> None:
+def test_what_has_started_counts_until_it_has_finished(budget: Budget) -> None:
     for pair in ("front", "rear"):
         assert budget.try_acquire(pair, S, suspected=False)
         budget.pay(Cost(worker_jobs.Kind.CHECK, pair, 2.0))
@@ -88,7 +90,7 @@ def test_what_has_begun_counts_until_it_has_ended(budget: Budget) -> None:
     assert budget.try_acquire("rear", S, suspected=False)
 
 
-def test_first_slices_end_apart_and_none_is_too_short_for_a_window(budget: Budget) -> None:
+def test_first_slices_end_at_different_times_and_none_is_too_short_for_a_window(budget: Budget) -> None:
     joined = [budget.join(name, MonitorConfig(), WindowConfig()) for name in ("left", "right")]
     assert joined == [pytest.approx(180.0 - 0.25 * 150.0), pytest.approx(180.0 - 0.75 * 150.0)]
     short = WindowConfig(slice_s=20.0)
@@ -109,13 +111,13 @@ def test_one_measurement_in_a_hurry_moves_no_price() -> None:
     assert price.cpu_s == 0.1
 
 
-def test_spending_is_told_over_the_last_minutes() -> None:
-    spending = CpuUsage(1000.0)
-    spending.add("check", "front", 1.0, 1001.0)
-    assert spending.cores(1001.0) == pytest.approx(1.0 / USAGE_BIN_S), "not over less than it is counted in"
-    assert spending.cores(1010.0) == pytest.approx(0.1)
+def test_usage_is_reported_over_the_last_minutes() -> None:
+    usage = CpuUsage(1000.0)
+    usage.add("check", "front", 1.0, 1001.0)
+    assert usage.cores(1001.0) == pytest.approx(1.0 / USAGE_BIN_S), "not over less than it is counted in"
+    assert usage.cores(1010.0) == pytest.approx(0.1)
     for second in range(1010, 2000, 10):
-        spending.add("check", "front", 4.0, float(second))
-    assert spending.cores(2000.0) == pytest.approx(0.4, rel=0.1)
-    assert spending.cores(2000.0 + USAGE_OVER_S + USAGE_BIN_S) == 0.0
-    assert spending.totals_s == {("check", "front"): pytest.approx(1.0 + 99 * 4.0)}
+        usage.add("check", "front", 4.0, float(second))
+    assert usage.cores(2000.0) == pytest.approx(0.4, rel=0.1)
+    assert usage.cores(2000.0 + USAGE_OVER_S + USAGE_BIN_S) == 0.0
+    assert usage.totals_s == {("check", "front"): pytest.approx(1.0 + 99 * 4.0)}

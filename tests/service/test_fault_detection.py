@@ -331,7 +331,9 @@ def test_a_right_mount_through_poor_stretches(tmp_path: Path) -> None:
         bench.worker.cause = None
         moments += driven(bench, range(second + poor, second + poor + good))
         second += poor + good
-    told = changes(moments)
-    assert {health for _, health, _ in told} <= {"healthy", "degraded"}, told
-    assert all(set(reasons) <= {"open_field", "dark", "settling"} for _, health, reasons in told if health != "healthy")
-    assert most_per_minute(moments) <= 1, told
+    reported = changes(moments)
+    assert {health for _, health, _ in reported} <= {"healthy", "degraded"}, reported
+    assert all(
+        set(reasons) <= {"open_field", "dark", "settling"} for _, health, reasons in reported if health != "healthy"
+    )
+    assert most_per_minute(moments) <= 1, reported

@@ -45,7 +45,7 @@ def test_a_drive_in_which_the_mount_moves_is_a_story_of_a_few_lines(
     monkeypatch.setattr(frame_selector, "PROGRESS_S", 0.0)
     caplog.set_level(logging.INFO)
     PairBench(tmp_path / "state").drive(BEGIN_S, DRIVE_END_S)
-    told = lines(caplog)
+    reported = lines(caplog)
     for expected in (
         "window: 1 of 10 pairs",
         "window ended with 10 pairs: it is recorded",
@@ -53,20 +53,20 @@ def test_a_drive_in_which_the_mount_moves_is_a_story_of_a_few_lines(
         "checks: they agree with what is served",
         "health: suspect, before healthy",
     ):
-        assert expected in told, told
-    solved = next(line for line in told if line.startswith("window solved, accepted: 0."))
+        assert expected in reported, reported
+    solved = next(line for line in reported if line.startswith("window solved, accepted: 0."))
     assert "σ 0.03°" in solved
-    assert all(line != before for before, line in pairwise(told)), "nothing is said twice in a row"
+    assert all(line != before for before, line in pairwise(reported)), "nothing is said twice in a row"
 
 
 def test_pairs_of_a_window_are_logged_at_a_bounded_rate(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """A drive of minutes goes through the bench in far less than `PROGRESS_S`."""
     caplog.set_level(logging.INFO)
     PairBench(tmp_path / "state").drive(BEGIN_S, STEP_S)
-    told = lines(caplog)
-    windows = sum(line.startswith("window ended") for line in told)
+    reported = lines(caplog)
+    windows = sum(line.startswith("window ended") for line in reported)
     assert windows > 1
-    assert sum(line.startswith("window: ") for line in told) <= windows + 1, told
+    assert sum(line.startswith("window: ") for line in reported) <= windows + 1, reported
 
 
 def test_checks_are_logged_when_what_they_say_changes(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -152,10 +152,10 @@ def test_a_stream_that_is_lost_and_comes_back_is_logged_at_a_bounded_rate(caplog
             clock.now_s += 1.0
             log.tick()
     log.push(sweep)
-    told = lines(caplog)
-    silent = [line for line in told if line.startswith("no lidar frames for")]
-    again = [line for line in told if line.startswith("lidar frames arrive again after")]
-    assert told[1] == "no lidar frames for 5 s: check the sensor and the network"
+    reported = lines(caplog)
+    silent = [line for line in reported if line.startswith("no lidar frames for")]
+    again = [line for line in reported if line.startswith("lidar frames arrive again after")]
+    assert reported[1] == "no lidar frames for 5 s: check the sensor and the network"
     assert 0 < len(silent) <= 20 * 2 * SILENT_S / QUIET_S + 1
     assert len(again) == len(silent)
 
@@ -163,7 +163,7 @@ def test_a_stream_that_is_lost_and_comes_back_is_logged_at_a_bounded_rate(caplog
 # --- losses -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_loss_is_described_in_words(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_loss_is_described_as_text(caplog: pytest.LogCaptureFixture) -> None:
     losses = LossCounter(logging.getLogger("test"), "front")
     losses.add("monitor", "not_awaited")
     losses.add("camera", "wrong_type", detail="expected an image")
@@ -173,6 +173,6 @@ def test_a_loss_is_described_in_words(caplog: pytest.LogCaptureFixture) -> None:
     assert second.getMessage() == "lost, camera: expected an image"
 
 
-def test_every_refusal_of_a_message_has_words() -> None:
+def test_every_refusal_of_a_message_has_text() -> None:
     assert {reason.value for reason in Refusal if reason not in EXPLAINED} <= set(LOST)
     assert loss_text("camera", "a_new_reason") == "lost, camera: a new reason"

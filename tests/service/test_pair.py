@@ -75,16 +75,16 @@ def test_a_step_is_noticed_within_a_minute_and_corrected_by_the_next_window(
     assert 0.8 * (DRIVE_END_S - BEGIN_S) < alarms.watched_s < DRIVE_END_S - BEGIN_S
 
 
-def test_every_event_is_told_to_whoever_keeps_the_seconds_around_it(
+def test_every_event_is_reported_to_whoever_keeps_the_seconds_around_it(
     bench: PairBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told: list[tuple[str, float]] = []
+    reported: list[tuple[str, float]] = []
     monkeypatch.setattr(
-        PairStream, "event", lambda _, name, pose: told.append((name, float(np.abs(pose - AFTER).max())))
+        PairStream, "event", lambda _, name, pose: reported.append((name, float(np.abs(pose - AFTER).max())))
     )
     bench.drive(BEGIN_S, DRIVE_END_S)
-    assert [name for name, _ in told] == ["suspect", "miscalibrated"]
-    assert min(off for _, off in told) > 0, "with what was served when it began"
+    assert [name for name, _ in reported] == ["suspect", "miscalibrated"]
+    assert min(off for _, off in reported) > 0, "with what was served when it began"
 
 
 def test_the_same_drive_gives_the_same_decisions(undisturbed: PairBench, bench: PairBench) -> None:
@@ -97,14 +97,14 @@ def test_the_same_drive_gives_the_same_decisions(undisturbed: PairBench, bench: 
     assert timeless[0] == timeless[1]
 
 
-def test_pairs_are_recorded_between_those_of_a_window_a_second_apart(bench: PairBench) -> None:
+def test_pairs_are_recorded_between_those_of_a_window_a_second_separate(bench: PairBench) -> None:
     bench.drive(BEGIN_S, STEP_S)
     for window_id, stamps_ns in list(bench.recorder.stamps.items())[:2]:
         between_ns = bench.recorder.between[window_id]
         assert stamps_ns[0] < between_ns[0]
         assert between_ns[-1] < stamps_ns[0] + 40 * NS_PER_S
-        apart_s = np.diff(sorted([*stamps_ns, *between_ns])) / NS_PER_S
-        assert apart_s.max() <= 1.5, "so far apart are two pairs, chosen or not"
+        separation_s = np.diff(sorted([*stamps_ns, *between_ns])) / NS_PER_S
+        assert separation_s.max() <= 1.5, "so far apart are two pairs, chosen or not"
         assert len(between_ns) > 2 * len(stamps_ns)
 
 
@@ -121,7 +121,7 @@ def test_a_worker_that_takes_its_time_changes_no_decision(undisturbed: PairBench
         slow.settle()
         waited += 1
     slow.drive(DRIVE_END_S, DRIVE_END_S)
-    told = [
+    reported = [
         [
             e.model_copy(update={"wall_ns": 0, "previous_sha256": ""})
             for e in b.entries("estimate", "extrinsic", "state")
@@ -129,7 +129,7 @@ def test_a_worker_that_takes_its_time_changes_no_decision(undisturbed: PairBench
         for b in (undisturbed, slow)
     ]
     assert waited > 0, "the stream waits for the worker"
-    assert told[0] == told[1]
+    assert reported[0] == reported[1]
     assert slow.losses == undisturbed.losses
 
 
@@ -164,8 +164,8 @@ def test_a_restart_in_the_middle_changes_no_decision(undisturbed: PairBench, tmp
     broken.drive(BEGIN_S + restart_s, DRIVE_END_S)
 
     def states(one: PairBench) -> list[str]:
-        told = [entry.code for entry in one.entries("state") if entry.code != "unknown"]
-        return [code for code, after in zip(told, [*told[1:], None], strict=True) if code != after]
+        reported = [entry.code for entry in one.entries("state") if entry.code != "unknown"]
+        return [code for code, after in zip(reported, [*reported[1:], None], strict=True) if code != after]
 
     assert states(broken) == states(undisturbed)
     np.testing.assert_allclose(broken.pose, undisturbed.pose, atol=1e-9)
@@ -180,17 +180,17 @@ def seeing(folder: Path) -> PairBench:
 
 def with_knock(bench: PairBench) -> tuple[list[int], list[int]]:
     """Stamps of the window that holds the step, and of the one after it, in seconds since the step."""
-    told = list(bench.recorder.stamps.values())
-    place = next(i for i, stamps in enumerate(told) if stamps[0] < STEP_S * NS_PER_S <= stamps[-1])
-    before, after = ([round(stamp / NS_PER_S) - STEP_S for stamp in stamps] for stamps in told[place : place + 2])
+    reported = list(bench.recorder.stamps.values())
+    place = next(i for i, stamps in enumerate(reported) if stamps[0] < STEP_S * NS_PER_S <= stamps[-1])
+    before, after = ([round(stamp / NS_PER_S) - STEP_S for stamp in stamps] for stamps in reported[place : place + 2])
     return before, after
 
 
 def test_the_pairs_after_a_knock_are_in_the_next_window_which_comes_the_sooner(tmp_path: Path) -> None:
     bench = seeing(tmp_path / "state")
     bench.drive(BEGIN_S, STEP_S + 30)
-    knocked, following = with_knock(bench)
-    after = [stamp for stamp in knocked if stamp >= 0]
+    displaced, following = with_knock(bench)
+    after = [stamp for stamp in displaced if stamp >= 0]
     assert after
     assert following[: len(after)] == after
     assert len(following) == bench.config.pairs[0].window.pairs
@@ -203,7 +203,7 @@ def test_the_pairs_after_a_knock_are_in_the_next_window_which_comes_the_sooner(t
 def test_a_restart_loses_no_pair_after_a_knock(tmp_path: Path, after_s: int) -> None:
     whole, broken = seeing(tmp_path / "whole"), seeing(tmp_path / "broken")
     whole.drive(STEP_S - 60, STEP_S + 30)
-    knocked, _ = with_knock(whole)
+    displaced, _ = with_knock(whole)
     restart_s = STEP_S + after_s
     broken.drive(STEP_S - 60, restart_s)
     stamps = broken.recorder.stamps
@@ -212,13 +212,13 @@ def test_a_restart_loses_no_pair_after_a_knock(tmp_path: Path, after_s: int) -> 
     broken.recorder.sees_moves, broken.recorder.stamps = True, stamps
     broken.drive(restart_s, STEP_S + 40)
     of_broken, following = with_knock(broken)
-    assert of_broken == knocked
-    after = [stamp for stamp in knocked if stamp >= 0]
+    assert of_broken == displaced
+    after = [stamp for stamp in displaced if stamp >= 0]
     assert following[: len(after)] == after
     np.testing.assert_allclose(broken.pose, AFTER, atol=1e-9)
 
 
-def test_what_is_kept_after_a_knock_does_not_hang_on_when_the_worker_answers(tmp_path: Path) -> None:
+def test_what_is_retained_after_a_displacement_does_not_hang_on_when_the_worker_answers(tmp_path: Path) -> None:
     quick, slow = seeing(tmp_path / "quick"), PairBench(tmp_path / "slow", worker=SlowWorker)
     slow.recorder.sees_moves = True
     assert isinstance(slow.worker, SlowWorker)
@@ -278,13 +278,13 @@ def test_apply_takes_the_named_candidate_and_no_other(tmp_path: Path) -> None:
 def test_a_roll_back_returns_to_any_accepted_calibration(bench: PairBench) -> None:
     bench.drive(BEGIN_S, DRIVE_END_S)
     served = bench.store.history.entries()
-    first = next(kept for kept in served if kept.entry.kind == "extrinsic")
+    first = next(retained for retained in served if retained.entry.kind == "extrinsic")
     assert bench.do("rollback", to=first.sha256[:12]) == "rolled_back"
     np.testing.assert_array_equal(bench.pose, np.array(first.entry.camera_from_lidar.matrix))  # type: ignore[union-attr]
     assert bench.health == "unknown"
     assert bench.do("rollback", to="0" * 64) == "not_found"
     assert bench.do("rollback", to=first.sha256[:4]) == "not_found"
-    last = [kept for kept in served if kept.entry.kind == "estimate"][-1]
+    last = [retained for retained in served if retained.entry.kind == "estimate"][-1]
     assert bench.do("rollback", to=last.entry.window_id) == "rolled_back"
     np.testing.assert_allclose(bench.pose, AFTER, atol=1e-9)
     bench.drive(DRIVE_END_S, DRIVE_END_S + 20)
@@ -334,8 +334,8 @@ def test_a_red_event_leaves_evidence(bench: PairBench) -> None:
     assert before.body["poses"] == after.body["poses"]
     assert before.body["names"] == after.body["names"]
     assert before.body["poses"][0] == served
-    told = bench.worker.estimates[event.window_after].optimum.T_camera_lidar
-    np.testing.assert_allclose(before.body["poses"][1], told, atol=1e-12)
+    reported = bench.worker.estimates[event.window_after].optimum.T_camera_lidar
+    np.testing.assert_allclose(before.body["poses"][1], reported, atol=1e-12)
     assert "accepted" in before.body["names"][1]
     (whole,) = (each for each in bench.store.incidents.events() if each.event_id == event.event_id)
     assert {point.state for point in whole.metrics} >= {"healthy", "suspect"}
@@ -358,8 +358,8 @@ def test_every_check_can_be_read_afterwards(bench: PairBench) -> None:
     suspect = next(check for check in history.checks if check.state == "suspect")
     assert (suspect.outcome, suspect.flagged) == ("suspect", True)
     assert suspect.evidence >= alarm_levels(bench.config.pairs[0].monitor).suspect
-    told = bench.answers.history(STEP_S * NS_PER_S, 2**63 - 1, 3).checks
-    assert told == history.checks[-3:]
+    reported = bench.answers.history(STEP_S * NS_PER_S, 2**63 - 1, 3).checks
+    assert reported == history.checks[-3:]
     health = bench.answers.health_reply
     assert health.check == history.checks[-1]
     bench.restart()
@@ -367,14 +367,14 @@ def test_every_check_can_be_read_afterwards(bench: PairBench) -> None:
 
 
 @pytest.mark.fault("a monitor that cannot look", "this is reported, and nothing stays green")
-def test_a_monitor_that_cannot_look_is_told_and_hides_no_green(bench: PairBench) -> None:
+def test_a_monitor_that_cannot_observation_is_reported_and_hides_no_green(bench: PairBench) -> None:
     bench.drive(BEGIN_S, BEGIN_S + 60)
     assert bench.answers.health_reply.state == "healthy"
     bench.worker.fault = Reason("internal_error", "The program failed (ZeroDivisionError: division by zero).")
     bench.drive(BEGIN_S + 60, BEGIN_S + 90)
-    told = bench.answers.health_reply
-    assert told.state == "degraded"
-    (reason,) = told.reasons
+    reported = bench.answers.health_reply
+    assert reported.state == "degraded"
+    (reason,) = reported.reasons
     assert reason.code == "monitor_blind"
     assert "ZeroDivisionError" in reason.text
     assert bench.answers.status().losses["check_internal_error"] >= 3
@@ -433,7 +433,7 @@ def test_bad_data_are_degraded_with_their_reason_and_move_nothing(bench: PairBen
 
 
 @pytest.mark.fault("a history that was tampered with", "health says so, and it is kept aside")
-def test_a_chain_that_was_tampered_with_is_told_and_kept_aside(bench: PairBench) -> None:
+def test_a_chain_that_was_tampered_with_is_reported_and_quarantined(bench: PairBench) -> None:
     bench.drive(BEGIN_S, BEGIN_S + 90)
     path = bench.folder / "history-front.jsonl"
     lines = path.read_bytes().splitlines(keepends=True)
@@ -450,7 +450,7 @@ def test_a_chain_that_was_tampered_with_is_told_and_kept_aside(bench: PairBench)
 
 
 @pytest.mark.fault("a forged state", "it is never served, and health says so")
-def test_a_forged_state_is_never_served_and_said_in_health(tmp_path: Path) -> None:
+def test_a_forged_state_is_never_served_and_reported_in_health(tmp_path: Path) -> None:
     bench = PairBench(tmp_path / "state")
     bench.drive(BEGIN_S, STEP_S)
     assert bench.health == "healthy"

@@ -62,14 +62,14 @@ def test_slices_are_longer_where_windows_are_not_all_afforded(tmp_path: Path) ->
     assert min(spans_s[1:]) > 60.0
 
 
-def test_a_suspicion_is_told_to_the_budget_until_it_is_over(tmp_path: Path) -> None:
+def test_a_suspicion_is_reported_to_the_budget_until_it_is_over(tmp_path: Path) -> None:
     bench = driven(tmp_path, 0.5, {Kind.CHECK: 0.1})
     assert not bench.budget.report().pairs["front"].suspected
-    told = set()
+    reported = set()
     for second in range(STEP_S, DRIVE_END_S):
         bench.drive(second, second + 1)
-        told.add((bench.health, bench.budget.report().pairs["front"].suspected))
-    assert ("miscalibrated", True) in told
+        reported.add((bench.health, bench.budget.report().pairs["front"].suspected))
+    assert ("miscalibrated", True) in reported
     bench.drive(DRIVE_END_S, DRIVE_END_S + 60)
     assert bench.health == "healthy"
     assert not bench.budget.report().pairs["front"].suspected

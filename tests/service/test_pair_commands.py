@@ -120,7 +120,7 @@ def test_each_command_in_each_state(tmp_path: Path, situation: str, order: int) 
         assert (bench.store.state.hold is not None) is (code == "held")
 
 
-def test_who_holds_it_and_why_is_told_wherever_one_asks_also_after_a_restart(tmp_path: Path) -> None:
+def test_who_holds_it_and_why_is_reported_wherever_one_requests_also_after_a_restart(tmp_path: Path) -> None:
     bench = PairBench(tmp_path / "state")
     assert bench.do("hold", reason="the mirror is being changed") == "held"
     for _ in range(2):
@@ -128,9 +128,9 @@ def test_who_holds_it_and_why_is_told_wherever_one_asks_also_after_a_restart(tmp
         assert extrinsic.hold is not None
         assert (extrinsic.held, extrinsic.hold.sender) == (True, "the test")
         assert extrinsic.hold.reason == "the mirror is being changed"
-        (said,) = (reason.text for reason in health.reasons if reason.code == "held")
-        assert "the test" in said
-        assert said.endswith("the mirror is being changed.")
+        (reported,) = (reason.text for reason in health.reasons if reason.code == "held")
+        assert "the test" in reported
+        assert reported.endswith("the mirror is being changed.")
         assert bench.entries("command")[-1].reason == "the mirror is being changed"
         bench.restart()
     assert bench.do("calibrate", reason="to see") == "too_few_pairs"
@@ -147,8 +147,8 @@ def test_a_calibrate_that_is_refused_as_busy_changes_nothing(tmp_path: Path, mon
     selected = bench.pair.stream.report.selection.selected
     assert selected >= 5
     monkeypatch.setattr(command_execution, "TIMEOUT_S", 0.0)
-    told = bench.pair.commands.carry_out("calibrate", {}, "the test")
-    assert (told.accepted, told.code) == (False, "busy")
+    report = bench.pair.commands.carry_out("calibrate", {}, "the test")
+    assert (report.accepted, report.code) == (False, "busy")
     bench.settle()
     assert (bench.pair.stream.report.selection.selected, bench.recorder.recorded) == (selected, 0)
     assert bench.answers.status().commands == {"calibrate_refused": 1}
@@ -166,8 +166,8 @@ def test_a_flood_of_commands_pushes_nothing_out_that_is_needed(tmp_path: Path, m
     for _ in range(10):
         codes = [bench.do("hold"), bench.do("hold", release=True), bench.do("reset"), bench.do("calibrate")]
         assert codes[:3] == ["held", "released", "reset"]
-    kept = bench.store.history.results()
-    assert all(result in kept for result in results)
+    retained = bench.store.history.results()
+    assert all(result in retained for result in results)
     bench.restart()
     assert bench.do("rollback", to=first.window_id) == "rolled_back"
     assert first.camera_from_lidar is not None
@@ -177,23 +177,23 @@ def test_a_flood_of_commands_pushes_nothing_out_that_is_needed(tmp_path: Path, m
     assert bench.do("commission") == "commissioning"
 
 
-def test_windows_that_a_pair_was_commissioned_from_are_kept_for_that_across_a_restart(tmp_path: Path) -> None:
+def test_windows_that_a_pair_was_commissioned_from_are_retained_for_that_across_a_restart(tmp_path: Path) -> None:
     bench = PairBench(tmp_path / "state")
     bench.drive(BEGIN_S, BEGIN_S + 90)
     first, *others = [result.window_id for result in bench.store.history.results()]
-    told = JobOutcome(Fate.RESULT, Commissioned(bench.pose, "0123abcd", 1, 10), None, 1.0)
-    bench.pair.manager.commissioned((first,), told)
+    report = JobOutcome(Fate.RESULT, Commissioned(bench.pose, "0123abcd", 1, 10), None, 1.0)
+    bench.pair.manager.commissioned((first,), report)
     bench.settle()
 
-    def kept_for() -> dict[str, str | None]:
+    def retained_for() -> dict[str, str | None]:
         bench.context.folder.scan()
         return {info.window_id: info.kept_for for info in bench.context.folder.listing("front")}
 
-    before = kept_for()
+    before = retained_for()
     assert before[first] == "commissioning"
     assert {before[name] for name in others} == {None}
     bench.restart()
-    assert kept_for() == before
+    assert retained_for() == before
 
 
 class CommissioningWorker(OracleWorker):
@@ -226,8 +226,8 @@ def commissioning(folder: Path) -> tuple[PairBench, CommissioningWorker]:
 @pytest.mark.fault("`commission` while a commissioning of the pair runs", "refused, with how far that is")
 def test_a_pair_is_commissioned_once_at_a_time(tmp_path: Path) -> None:
     bench, worker = commissioning(tmp_path / "state")
-    told = [bench.do("commission") for _ in range(3)]
-    assert told == ["commissioning_underway"] * 3
+    report = [bench.do("commission") for _ in range(3)]
+    assert report == ["commissioning_underway"] * 3
     assert len(worker.jobs) == 1
     assert "(spread 4 of 10)" in bench.entries("command")[-1].text
     held = bench.context.folder._held
@@ -262,8 +262,8 @@ def test_commands_that_come_too_fast_are_answered_and_do_nothing(
     codes = [bench.do("hold") for _ in range(command_execution.BURST)]
     assert set(codes) == {"held"}
     before = bench.store.history.entries()
-    told = [bench.pair.commands.carry_out("hold", {"release": True}, "the test") for _ in range(5)]
-    assert {(one.accepted, one.code) for one in told} == {(False, "too_many")}
+    report = [bench.pair.commands.carry_out("hold", {"release": True}, "the test") for _ in range(5)]
+    assert {(one.accepted, one.code) for one in report} == {(False, "too_many")}
     assert bench.store.state.hold is not None
     assert bench.store.history.entries() == before
     assert bench.answers.status().commands == {"hold_accepted": command_execution.BURST, "hold_refused": 5}
@@ -273,13 +273,13 @@ def route_of(bench: PairBench, command: str) -> Route:
     """Who answers the command."""
     keys, pair, unasked = Keys("coec", "test"), bench.pair, SerializedReply(b"", b"")
     bus = create_autospec(Bus, instance=True)
-    reception = CommandHandler(
+    command_handler = CommandHandler(
         CommandRules(Authority(AuthorityConfig(), lambda: None), None), {pair.name: pair.commands}
     )
     VehicleRoutes(
         keys,
         {pair.name: pair.answers},
-        reception,
+        command_handler,
         lambda: unasked,
         lambda: b"",
         lambda: unasked,
@@ -300,8 +300,12 @@ def test_what_its_sender_has_given_up_on_is_not_done(tmp_path: Path, name: str) 
     bench.drive(BEGIN_S, BEGIN_S + 30)
     selected, entries = bench.pair.stream.report.selection.selected, len(bench.entries("command"))
     route = route_of(bench, name)
-    came_s = time.monotonic() - COMMAND_TIMEOUT_MS / 1e3
-    for parameters, received_s in (("", came_s), ("timeout_ms=500", time.monotonic() - 0.5), ("timeout_ms=20", None)):
+    arrived_s = time.monotonic() - COMMAND_TIMEOUT_MS / 1e3
+    for parameters, received_s in (
+        ("", arrived_s),
+        ("timeout_ms=500", time.monotonic() - 0.5),
+        ("timeout_ms=20", None),
+    ):
         received_s = time.monotonic() if received_s is None else received_s  # nobody gets to it for 20 ms
         answer = route.answer(Request(route.key, f"format=json;{parameters}", b"", received_s))
         assert (json.loads(answer.payload)["accepted"], json.loads(answer.payload)["code"]) == (False, "expired")

@@ -80,15 +80,20 @@ class Watched:
 
     def __init__(self, folder: Path, worker: type[OracleWorker]) -> None:
         self.bench = PairBench(folder, worker=worker)
-        self.looked: list[Any] = []
+        self.checked: list[Any] = []
         self.windows: list[Any] = []
         self.checks: list[Any] = []
         bench = self.bench
         bench.recorder.sees_moves = True
-        choose, add, end, ask = bench.pair._selector.choose, bench.recorder.add, bench.recorder.end, bench.worker.submit
+        choose, add, end, query = (
+            bench.pair._selector.choose,
+            bench.recorder.add,
+            bench.recorder.end,
+            bench.worker.submit,
+        )
 
-        def chosen(pair: FramePair) -> None:
-            self.looked.append((pair.camera.stamp_ns, pair.lidar.stamp_ns, pair.motion))
+        def selected(pair: FramePair) -> None:
+            self.checked.append((pair.camera.stamp_ns, pair.lidar.stamp_ns, pair.motion))
             choose(pair)
 
         def added(window_id: str, pair: FramePair, T_camera_lidar: Matrix4) -> None:
@@ -99,15 +104,15 @@ class Watched:
             self.windows.append(slice_end)
             end(slice_end)
 
-        def asked(job: WorkerJob) -> None:
+        def requested(job: WorkerJob) -> None:
             if job.kind is Kind.CHECK:
                 pairs = unpack_pairs(job.body["frames"], LimitsConfig())
                 self.checks.append((job.body["pose"], [(pair.stamp_ns, pair.motion) for pair in pairs]))
-            ask(job)
+            query(job)
 
-        bench.pair._selector.choose = chosen  # type: ignore[method-assign]
+        bench.pair._selector.choose = selected  # type: ignore[method-assign]
         bench.recorder.add, bench.recorder.end = added, finished  # type: ignore[method-assign]
-        bench.worker.submit = asked  # type: ignore[method-assign]
+        bench.worker.submit = requested  # type: ignore[method-assign]
 
     def push(self, frame: Frame) -> None:
         self.bench.pair.stream.push(frame)
@@ -125,7 +130,7 @@ class Watched:
         pytest.fail("pairs wait for ever")
 
     @property
-    def told(self) -> dict[str, Any]:
+    def reported(self) -> dict[str, Any]:
         entries = [
             entry.model_copy(update={"wall_ns": 0, "previous_sha256": "", "sequence": 0})
             for entry in self.bench.entries("estimate", "extrinsic")
@@ -133,7 +138,7 @@ class Watched:
         # Whether an answer is overdue is the clock's on the wall to say.
         codes = [entry.code for entry in self.bench.entries("state") if entry.code not in ("degraded", "stale")]
         return {
-            "looked": self.looked,
+            "looked": self.checked,
             "windows": self.windows,
             "checks": self.checks,
             "entries": entries,
@@ -152,7 +157,7 @@ def calm(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         for frame in sorted(chain(*streams().values()), key=lambda frame: frame.stamp_ns):
             watched.push(frame)
         watched.finish()
-    return watched.told
+    return watched.reported
 
 
 def may_come(stream: str, waiting: dict[str, deque[Frame]]) -> bool:
@@ -198,7 +203,7 @@ def disturbed(folder: Path, seed: int, clock: Clock) -> dict[str, Any]:
         stream.tick(waiting=False)
     watched.finish()
     assert "degraded" in [entry.code for entry in bench.entries("state")], "checks were overdue"
-    return watched.told
+    return watched.reported
 
 
 def wait_in_silence(watched: Watched, clock: Clock) -> None:
@@ -220,9 +225,9 @@ def wait_in_silence(watched: Watched, clock: Clock) -> None:
 def test_whatever_the_machine_does_the_same_frames_make_the_same_decisions(
     tmp_path: Path, calm: dict[str, Any], seed: int, clock: Clock, record_property: Callable[[str, object], None]
 ) -> None:
-    told = disturbed(tmp_path / "disturbed", seed, clock)
+    reported = disturbed(tmp_path / "disturbed", seed, clock)
     record_property("figure", f"{len(calm['looked'])} pairs, {len(calm['checks'])} checks, all equal")
     assert len(calm["checks"]) > 20
     assert {"suspect", "miscalibrated", "healthy"} <= set(calm["states"])
     for what in calm:
-        assert told[what] == calm[what], what
+        assert reported[what] == calm[what], what

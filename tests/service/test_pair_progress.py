@@ -16,15 +16,15 @@ def bench(tmp_path: Path) -> PairBench:
     return PairBench(tmp_path / "state")
 
 
-def test_a_drive_played_three_times_is_looked_at_each_time(bench: PairBench) -> None:
+def test_a_drive_played_three_times_is_checked_each_time(bench: PairBench) -> None:
     for turn in range(3):
         bench.drive(BEGIN_S, BEGIN_S + 60)
         assert bench.health == "healthy"
         assert bench.answers.status().checks >= 8 * (turn + 1)
         assert len(bench.pair.stream._held) == 0
-    told = [entry.text for entry in bench.entries("state") if entry.code == "unknown"]
-    assert len(told) == 2
-    assert all("stepped back" in text and "Last known: healthy" in text for text in told)
+    reported = [entry.text for entry in bench.entries("state") if entry.code == "unknown"]
+    assert len(reported) == 2
+    assert all("stepped back" in text and "Last known: healthy" in text for text in reported)
     assert bench.losses["monitor", "time_stepped_back"] == 2
     assert ("monitor", "not_awaited") not in bench.losses
 
@@ -39,7 +39,7 @@ def test_after_stamps_an_hour_ahead_the_old_time_goes_on_at_once(bench: PairBenc
     assert len(bench.pair.stream._held) == 0
 
 
-def test_a_worker_that_takes_its_time_while_time_steps_back_is_awaited_and_holds_up_nothing(tmp_path: Path) -> None:
+def test_a_worker_that_takes_its_time_while_time_steps_back_is_pending_and_holds_up_nothing(tmp_path: Path) -> None:
     bench = PairBench(tmp_path / "state", worker=SlowWorker)
     assert isinstance(bench.worker, SlowWorker)
 
@@ -87,14 +87,14 @@ def test_a_mount_that_was_moved_before_a_start_at_a_standstill(bench: PairBench)
 
 
 @pytest.mark.fault("windows that come to nothing", "after three in a row, health says so")
-def test_a_window_that_is_lost_is_answered_for_and_three_in_a_row_are_said(bench: PairBench) -> None:
+def test_a_window_that_is_lost_is_answered_for_and_three_in_a_row_are_reported(bench: PairBench) -> None:
     bench.drive(BEGIN_S, BEGIN_S + 45)
     bench.recorder.loses = True
     bench.drive(BEGIN_S + 45, BEGIN_S + 90)
     assert (bench.losses["window", "not_recorded"], bench.answers.health_reply.state) == (1, "healthy")
     bench.drive(BEGIN_S - 200, BEGIN_S - 60)
-    told = bench.answers.health_reply
-    assert (told.state, [reason.code for reason in told.reasons]) == ("degraded", ["windows_in_vain"])
+    reported = bench.answers.health_reply
+    assert (reported.state, [reason.code for reason in reported.reasons]) == ("degraded", ["windows_in_vain"])
     bench.recorder.loses = False
     bench.drive(BEGIN_S - 60, BEGIN_S)
     assert bench.answers.health_reply.state == "healthy"
@@ -104,8 +104,8 @@ def test_a_window_that_comes_to_nothing_is_no_check(bench: PairBench) -> None:
     bench.worker.window_fault = Reason("worker_failed", "The worker failed on this window 2 times.")
     bench.worker.fault = Reason("bad_model", "no network")
     bench.drive(BEGIN_S, BEGIN_S + 60)
-    told = bench.answers.health_reply
-    assert (told.state, told.age_s, told.evaluated_ns) == ("unknown", None, None)
+    reported = bench.answers.health_reply
+    assert (reported.state, reported.age_s, reported.evaluated_ns) == ("unknown", None, None)
 
 
 @pytest.mark.fault("checks that never complete, for whatever reason", "after three periods nothing is green")
@@ -115,10 +115,10 @@ def test_without_a_completed_check_in_three_periods_nothing_is_green(
     bench.drive(BEGIN_S, BEGIN_S + 60)
     assert bench.answers.health_reply.state == "healthy"
     bench.pair.manager.check_clocks(time.monotonic() + 16.0)
-    told = bench.answers.health_reply
-    assert (told.state, told.level) == ("degraded", 1)
-    assert [reason.code for reason in told.reasons] == ["overdue_data", "last_known"]
-    assert "no camera frames come" in told.reasons[0].text
+    reported = bench.answers.health_reply
+    assert (reported.state, reported.level) == ("degraded", 1)
+    assert [reason.code for reason in reported.reasons] == ["overdue_data", "last_known"]
+    assert "no camera frames come" in reported.reasons[0].text
     bench.pair.manager.check_clocks(time.monotonic() + 601.0)
     assert bench.health == "stale"
     bench.drive(BEGIN_S + 60, BEGIN_S + 72)
@@ -140,9 +140,9 @@ def test_a_state_from_another_time_is_not_green(
     now_ns = time.time_ns()
     monkeypatch.setattr(time, "time_ns", lambda: now_ns - setback_s * NS_PER_S)
     bench.restart()
-    told = bench.answers.health_reply
-    assert told.state == "unknown"
-    assert told.age_s is None or told.age_s >= 0.0
-    assert [reason.code for reason in told.reasons] == ["restarted", "last_known"]
+    reported = bench.answers.health_reply
+    assert reported.state == "unknown"
+    assert reported.age_s is None or reported.age_s >= 0.0
+    assert [reason.code for reason in reported.reasons] == ["restarted", "last_known"]
     bench.drive(BEGIN_S + 60, BEGIN_S + 72)
     assert bench.answers.health_reply.state == "healthy"

@@ -62,8 +62,8 @@ class DimWorker(OracleWorker):
     def _check(self, job: WorkerJob) -> Checked:
         checked = super()._check(job)
         vague = np.full(6, 0.2)
-        said = replace(checked.observation, offset=np.zeros(6), sigma=vague, noise=vague, flagged=False)
-        return replace(checked, observation=said)
+        reported = replace(checked.observation, offset=np.zeros(6), sigma=vague, noise=vague, flagged=False)
+        return replace(checked, observation=reported)
 
 
 class RigBench:
@@ -76,15 +76,15 @@ class RigBench:
         self.rng = random.Random(seed)
         self.intake = Intake(config.limits)
         self.keys = Keys("coec", config.vehicle)
-        scribe: DiskWriter = InstantDiskWriter(folder)
-        self.rig = RigEstimatorThread(folder, (), scribe)
+        disk_writer: DiskWriter = InstantDiskWriter(folder)
+        self.rig = RigEstimatorThread(folder, (), disk_writer)
         self.answers = RigAnswers(self.keys, lambda *_: None)
         windows = WindowStore(folder / "windows", config.state)
-        outside = VehicleContext(
+        context = VehicleContext(
             self.keys,
             self.intake,
             StateStore(folder, config.vehicle),
-            scribe,
+            disk_writer,
             windows,
             cast("Worker", None),
             Budget(config.budget, lambda: 0.0),
@@ -100,8 +100,8 @@ class RigBench:
             patch.setattr(runtime_pair, "Recorder", InstantRecorder)
             for pair in config.pairs:
                 worker = DimWorker() if pair.name == dim else OracleWorker()
-                object.__setattr__(outside, "worker", worker)
-                self.pairs[pair.name] = Pair(pair, config, outside)
+                object.__setattr__(context, "worker", worker)
+                self.pairs[pair.name] = Pair(pair, config, context)
                 cast("InstantRecorder", self.pairs[pair.name].recorder).worker = worker
         self.rig.connect(self.answers.on_update, lambda: None)
         self.settle()
@@ -137,11 +137,11 @@ class RigBench:
         commands = {name: pair.commands for name, pair in self.pairs.items()}
         rig = RigCommands("test", commands, lambda: self.reply)
         with ThreadPoolExecutor(1) as other:
-            told = other.submit(rig.carry_out, name, arguments, "the test")
-            while not told.done():
+            report = other.submit(rig.carry_out, name, arguments, "the test")
+            while not report.done():
                 self.settle()
         self.settle()
-        return told.result()
+        return report.result()
 
     @property
     def reply(self) -> RigReply:
@@ -149,9 +149,9 @@ class RigBench:
 
     def entries(self, name: str, *kinds: str) -> list[HistoryEntry]:
         store = self.pairs[name].answers._store
-        return [kept.entry for kept in store.history.entries() if kept.entry.kind in kinds]
+        return [retained.entry for retained in store.history.entries() if retained.entry.kind in kinds]
 
-    def told(self) -> dict[str, bytes]:
+    def report(self) -> dict[str, bytes]:
         """All that a replay must come to again."""
         extrinsics = {name: to_json(pair.answers.extrinsic_reply) for name, pair in self.pairs.items()}
         return {**extrinsics, "rig": to_json(self.reply)}
@@ -164,7 +164,7 @@ class RigBench:
 
 
 @pytest.mark.fault("a knocked LiDAR, three cameras, policy `within_limits`", "one correction, served by all pairs")
-def test_a_knocked_lidar_is_corrected_once_for_all_pairs_and_the_same_in_a_replay(
+def test_a_displaced_lidar_is_corrected_once_for_all_pairs_and_the_same_in_a_replay(
     tmp_path: Path, record_property: Callable[[str, object], None]
 ) -> None:
     bench = RigBench(tmp_path / "one")
@@ -188,7 +188,7 @@ def test_a_knocked_lidar_is_corrected_once_for_all_pairs_and_the_same_in_a_repla
         assert len(served) == 1
     again = RigBench(tmp_path / "two", seed=1)
     again.drive(STEP_S - 45, STEP_S + 65)
-    assert again.told() == bench.told()
+    assert again.report() == bench.report()
     assert again.decisions() == bench.decisions()
     record_property("figure", f"{(reply.correction.stamp_ns / NS_PER_S) - STEP_S:.0f} s after the knock")
 
@@ -213,9 +213,9 @@ def test_a_pair_that_suspects_nothing_has_its_window_as_soon_as_its_sensor_is_na
     correction = bench.reply.correction
     assert correction is not None
     assert set(correction.pairs) == set(CAMERAS)
-    came_s = correction.stamp_ns / NS_PER_S - STEP_S
-    record_property("figure", f"{came_s:.0f} s after the knock")
-    assert came_s < 60.0
+    received_s = correction.stamp_ns / NS_PER_S - STEP_S
+    record_property("figure", f"{received_s:.0f} s after the knock")
+    assert received_s < 60.0
 
 
 def test_where_people_decide_the_correction_waits_for_them(tmp_path: Path) -> None:

@@ -28,19 +28,19 @@ class Line:
     """A bus and its vehicle: who listens to a topic hears what is put there."""
 
     def __init__(self) -> None:
-        self.heard: dict[str, Callable[[InputSample], None]] = {}
+        self.received: dict[str, Callable[[InputSample], None]] = {}
         self.latched: list[str] = []
         self.subscribed: list[str] = []
-        self.ended: list[str] = []
+        self.finished: list[str] = []
 
     def subscribe(self, stream: StreamInput, on_sample: Callable[[InputSample], None]) -> Callable[[], None]:
         (topic,) = stream.expressions
-        self.heard[topic] = on_sample
+        self.received[topic] = on_sample
         self.subscribed.append(topic)
 
         def end() -> None:
-            self.ended.append(topic)
-            del self.heard[topic]
+            self.finished.append(topic)
+            del self.received[topic]
 
         return end
 
@@ -59,8 +59,8 @@ class Line:
 
     def put(self, *topics: str) -> None:
         for topic in topics:
-            if topic in self.heard:
-                self.heard[topic](SAMPLES[topic])
+            if topic in self.received:
+                self.received[topic](SAMPLES[topic])
 
 
 @pytest.fixture
@@ -72,7 +72,7 @@ def stack() -> Iterator[ExitStack]:
 def opened(stack: ExitStack, config: Config, folder: Path) -> tuple[PendingPairs, Line, World]:
     room, line = PendingPairs(config, folder), Line()
     world = World(folder, room.nominal)
-    room.open(room.complete(config), world.outside)
+    room.open(room.complete(config), world.context)
     room.listen(cast("Bus", line), cast("RosSide", line))
     for thread in room.threads:
         stack.callback(thread.join, 20.0)
@@ -80,7 +80,7 @@ def opened(stack: ExitStack, config: Config, folder: Path) -> tuple[PendingPairs
     return room, line, world
 
 
-def found(room: PendingPairs) -> dict[str, PairConfig]:
+def result(room: PendingPairs) -> dict[str, PairConfig]:
     """Of the first hand-over."""
     handed: list[dict[str, PairConfig]] = []
 
@@ -92,7 +92,7 @@ def found(room: PendingPairs) -> dict[str, PairConfig]:
     return handed[-1]
 
 
-def test_where_nobody_is_awaited_nothing_is_listened_to(stack: ExitStack, tmp_path: Path) -> None:
+def test_where_nobody_is_pending_nothing_is_listened_to(stack: ExitStack, tmp_path: Path) -> None:
     intrinsics = {"model": "pinhole", "width": 8, "height": 6, "fx": 4, "fy": 4, "cx": 4, "cy": 3}
     camera = {"topic": CAMERA, "intrinsics": intrinsics, "frame_id": "camera"}
     lidar = {"topic": POINTS, "frame_id": "lidar"}
@@ -100,14 +100,14 @@ def test_where_nobody_is_awaited_nothing_is_listened_to(stack: ExitStack, tmp_pa
     document = configured(tmp_path).model_dump(include={"middleware", "state"})
     config = Config.model_validate({**document, "pairs": [{"name": "front", **given}]})
     room, line, _ = opened(stack, config, tmp_path)
-    assert (room.threads, room.answers, line.heard, room.pop_discovered()) == ((), {}, {}, {})
+    assert (room.threads, room.answers, line.received, room.pop_discovered()) == ((), {}, {}, {})
     assert room.complete(config) == config
 
 
-def test_a_pair_is_handed_over_once_everything_is_heard(stack: ExitStack, tmp_path: Path) -> None:
+def test_a_pair_is_handed_over_once_everything_is_received(stack: ExitStack, tmp_path: Path) -> None:
     config = configured(tmp_path)
     room, line, world = opened(stack, config, tmp_path)
-    assert set(line.heard) == {CAMERA, POINTS, INFO, TF_STATIC}
+    assert set(line.received) == {CAMERA, POINTS, INFO, TF_STATIC}
     assert set(line.latched) == {INFO, TF_STATIC}, "what was said before counts, too"
     line.put(INFO, TF_STATIC, POINTS)
     wait_until(lambda: [one.code for one in room.nominal("front").awaits] == ["no_image"], "what is missing is told")
@@ -116,20 +116,20 @@ def test_a_pair_is_handed_over_once_everything_is_heard(stack: ExitStack, tmp_pa
     assert b"no_image" in world.published[-1][1].payload
 
     line.put(CAMERA)
-    pair = found(room)["front"]
+    pair = result(room)["front"]
     np.testing.assert_allclose(pair.T_camera_lidar, T_CAMERA_LIDAR, atol=1e-12)
     assert room.answers == {}, "whoever is handed over is answered for elsewhere"
-    assert set(line.heard) == {INFO, TF_STATIC}, "changes are told for as long as the service runs"
+    assert set(line.received) == {INFO, TF_STATIC}, "changes are told for as long as the service runs"
     line.put(INFO, TF_STATIC)
     assert room.pop_discovered() == {}, "once"
 
 
 @pytest.mark.fault("a restart of a vehicle whose pairs were found on the bus", "they are served at once, as found")
-def test_a_restart_has_what_was_found(stack: ExitStack, tmp_path: Path) -> None:
+def test_a_restart_has_what_was_discovered(stack: ExitStack, tmp_path: Path) -> None:
     config = configured(tmp_path)
     room, line, _ = opened(stack, config, tmp_path)
     line.put(*SAMPLES)
-    pair = found(room)["front"]
+    pair = result(room)["front"]
 
     again = PendingPairs(config, tmp_path)
     complete = again.complete(config)
@@ -140,7 +140,7 @@ def test_a_restart_has_what_was_found(stack: ExitStack, tmp_path: Path) -> None:
 
 
 @pytest.mark.fault("what was found of a pair cannot be used", "it is awaited until something else is heard")
-def test_a_pair_that_cannot_be_built_is_awaited_again(stack: ExitStack, tmp_path: Path) -> None:
+def test_a_pair_that_cannot_be_built_is_pending_again(stack: ExitStack, tmp_path: Path) -> None:
     room, line, world = opened(stack, configured(tmp_path), tmp_path)
     line.put(*SAMPLES)
     wait_until(lambda: [one.code for one in room.nominal("front").awaits] == ["being_built"], "it is found")
@@ -151,26 +151,26 @@ def test_a_pair_that_cannot_be_built_is_awaited_again(stack: ExitStack, tmp_path
     assert list(room.answers) == ["front"]
 
 
-def test_the_end_of_the_service_is_told_for_those_who_wait(stack: ExitStack, tmp_path: Path) -> None:
+def test_the_end_of_the_service_is_reported_for_those_who_wait(stack: ExitStack, tmp_path: Path) -> None:
     room, _, world = opened(stack, configured(tmp_path), tmp_path)
     room.fail(Reason("thread_died", "The thread look-out died."))
     assert b"thread_died" in world.published[-1][1].payload
 
 
-def test_what_is_given_and_cannot_be_used_is_told_at_once(tmp_path: Path) -> None:
+def test_what_is_given_and_cannot_be_used_is_reported_at_once(tmp_path: Path) -> None:
     config = configured(tmp_path, T_camera_lidar=np.eye(4).tolist(), camera={"topic": CAMERA, "mask": "absent.png"})
     with pytest.raises(ConfigError, match="absent"):
         PendingPairs(config, tmp_path)
 
 
-def test_what_several_pairs_wait_for_is_listened_to_once_until_the_last_is_found(
+def test_what_several_pairs_wait_for_is_listened_to_once_until_the_last_is_detected(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cameras = [{"name": name, "topic": f"/{name}/image_raw"} for name in ("front", "rear")]
     lidars = [{"name": name, "topic": f"/{name}/points"} for name in ("roof", "left")]
     config = config_of({"middleware": "ros2dds", "cameras": cameras, "lidars": lidars, "pairs": "all"})
-    told: list[tuple[str, str]] = []
-    monkeypatch.setattr(DiscoveryListener, "take_frame", lambda _, pair, kind, __: told.append((pair, kind)))
+    reported: list[tuple[str, str]] = []
+    monkeypatch.setattr(DiscoveryListener, "take_frame", lambda _, pair, kind, __: reported.append((pair, kind)))
     room, ears = PendingPairs(config, tmp_path), Line()
     monkeypatch.setattr(room._listener.thread, "start", lambda: None)
     room.open(config, PairBench(tmp_path / "bench").context)
@@ -179,13 +179,13 @@ def test_what_several_pairs_wait_for_is_listened_to_once_until_the_last_is_found
     topics = {f"/{name}/image_raw" for name in ("front", "rear")} | {f"/{name}/points" for name in ("roof", "left")}
     infos = {"/front/camera_info", "/rear/camera_info"}
     assert Counter(ears.subscribed) == Counter(topics | infos | {TF_STATIC})
-    ears.heard["/roof/points"](InputSample(b"", ""))
-    assert told == [("front-roof", "lidar"), ("rear-roof", "lidar")]
+    ears.received["/roof/points"](InputSample(b"", ""))
+    assert reported == [("front-roof", "lidar"), ("rear-roof", "lidar")]
     (pair,) = PairBench(tmp_path / "other").config.pairs
     ready = iter([{"front-roof": DiscoveredPair(pair, {})}, {"front-left": DiscoveredPair(pair, {})}])
     monkeypatch.setattr(room._listener, "ready", lambda: next(ready))
     assert [*room.pop_discovered(), *room.pop_discovered()] == ["front-roof", "front-left"]
-    assert ears.ended == ["/front/image_raw"]
-    told.clear()
-    ears.heard["/roof/points"](InputSample(b"", ""))
-    assert told == [("rear-roof", "lidar")]
+    assert ears.finished == ["/front/image_raw"]
+    reported.clear()
+    ears.received["/roof/points"](InputSample(b"", ""))
+    assert reported == [("rear-roof", "lidar")]

@@ -24,11 +24,11 @@ INTRINSICS = {"model": "pinhole", "width": 8, "height": 6, "fx": 4.0, "fy": 4.0,
 class Attentive(OracleWorker):
     """Remembers by which settings it was to check."""
 
-    asked: list[Any] = field(default_factory=list)
+    requested: list[Any] = field(default_factory=list)
 
     def submit(self, job: WorkerJob) -> None:
         if job.kind is Kind.CHECK:
-            self.asked.append(job.body["configuration"])
+            self.requested.append(job.body["configuration"])
         super().submit(job)
 
 
@@ -59,7 +59,7 @@ def test_nothing_that_differs_changes_nothing(tmp_path: Path) -> None:
     assert reloaded(config) == Reload(config, (), ())
 
 
-def test_a_pair_that_was_found_is_compared_as_it_was_found_and_one_that_is_awaited_waits() -> None:
+def test_a_pair_that_was_discovered_is_compared_as_it_was_discovered_and_one_that_is_pending_waits() -> None:
     rear = {"name": "rear", "camera": "/rear/image", "points": "/top/points"}
     read = Config.model_validate(
         {"middleware": "rmw_zenoh", "pairs": [{**rear, "name": "front", "camera": "/front/image"}, rear]}
@@ -67,14 +67,14 @@ def test_a_pair_that_was_found_is_compared_as_it_was_found_and_one_that_is_await
     camera = {"topic": "/front/image", "frame_id": "camera", "intrinsics": INTRINSICS}
     lidar = {"topic": "/top/points", "frame_id": "lidar"}
     front = PairConfig.model_validate({"name": "front", "camera": camera, "lidar": lidar, "T_camera_lidar": IDENTITY})
-    found = {"front": front}
-    running = completed(read, found)
-    assert reload_of(running, completed(read, found)) == Reload(running, (), ())
+    result = {"front": front}
+    running = completed(read, result)
+    assert reload_of(running, completed(read, result)) == Reload(running, (), ())
 
     window = {"window": WindowConfig(pairs=12)}
     other = read.model_copy(update={"awaited": tuple(pair.model_copy(update=window) for pair in read.awaited)})
-    found = {"front": front.model_copy(update=window)}
-    fresh = reload_of(running, completed(other, found))
+    result = {"front": front.model_copy(update=window)}
+    fresh = reload_of(running, completed(other, result))
     assert fresh.taken == ("pairs.front.window.pairs",)
     assert fresh.waiting == ("awaited.rear.window.pairs",)
     assert fresh.config.pairs[0].window.pairs == 12
@@ -196,4 +196,4 @@ def test_checks_and_windows_say_by_which_settings(tmp_path: Path) -> None:
     assert bench.recorder.plan.metadata["settings_hash"] == settings_hash(pair) != before
     bench.drive(BEGIN_S, BEGIN_S + 20)
     assert isinstance(bench.worker, Attentive)
-    assert {one["verdict"]["min_overlap"] for one in bench.worker.asked} == {0.25}
+    assert {one["verdict"]["min_overlap"] for one in bench.worker.requested} == {0.25}

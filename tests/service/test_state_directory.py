@@ -23,8 +23,8 @@ from support.vehicles import BEGIN_S, DRIVE_END_S, PAIR_RIG, STEP_S, PairBench, 
 
 def books(folder: Path) -> dict[str, int]:
     """The files of a state directory but for the windows: path below it, and size."""
-    found = (path for path in sorted(folder.rglob("*")) if path.is_file() and "windows" not in path.parts)
-    return {str(path.relative_to(folder)): path.stat().st_size for path in found}
+    result = (path for path in sorted(folder.rglob("*")) if path.is_file() and "windows" not in path.parts)
+    return {str(path.relative_to(folder)): path.stat().st_size for path in result}
 
 
 def remove(folder: Path, how: str) -> None:
@@ -45,8 +45,8 @@ def test_books_that_somebody_removed_are_written_again_from_memory(tmp_path: Pat
     before, entries = books(bench.folder), bench.store.history.entries()
     assert len(before) > 5
     remove(bench.folder, how)
-    told = bench.acknowledged("hold")
-    assert (told.code, told.durable) == ("held", True)
+    reported = bench.acknowledged("hold")
+    assert (reported.code, reported.durable) == ("held", True)
     (bench.folder / "windows").mkdir()  # as the recorder does, which the bench has none of
     bench.drive(STEP_S + 60, STEP_S + 66)
     after = books(bench.folder)
@@ -54,8 +54,8 @@ def test_books_that_somebody_removed_are_written_again_from_memory(tmp_path: Pat
     pictures = {name for name in before if name.endswith(".jpg")}
     copies = {name for name in before if name.endswith(".previous")}
     assert set(before) - pictures - copies <= set(after)
-    kept, served, hold = bench.store.history.entries(), bench.pose.copy(), bench.store.state.hold
-    assert kept[: len(entries)] == entries
+    retained, served, hold = bench.store.history.entries(), bench.pose.copy(), bench.store.state.hold
+    assert retained[: len(entries)] == entries
     rewritten = [entry.text for entry in bench.entries("chain")]
     if how == "made again":
         assert len(rewritten) == 1
@@ -64,7 +64,7 @@ def test_books_that_somebody_removed_are_written_again_from_memory(tmp_path: Pat
     bench.restart()
     assert bench.store.damage is None
     assert bench.store.history.damage is None
-    assert [one.line for one in bench.store.history.entries()][: len(kept)] == [one.line for one in kept]
+    assert [one.line for one in bench.store.history.entries()][: len(retained)] == [one.line for one in retained]
     assert bench.pose.tobytes() == served.tobytes()
     assert bench.store.state.hold == hold
     assert all(event.overlays == () for event in bench.store.incidents.events())
@@ -75,22 +75,22 @@ def test_without_a_state_directory_nothing_counts_as_written(tmp_path: Path) -> 
     bench = PairBench(tmp_path / "state")
     bench.drive(BEGIN_S, BEGIN_S + 20)
     remove(bench.folder, "gone")
-    told = bench.acknowledged("hold")
-    assert (told.code, told.durable) == ("held", False)
-    trouble = bench.context.disk_writer.problem
-    assert trouble is not None
-    assert trouble.code == "disk_failing"
+    reported = bench.acknowledged("hold")
+    assert (reported.code, reported.durable) == ("held", False)
+    problem = bench.context.disk_writer.problem
+    assert problem is not None
+    assert problem.code == "disk_failing"
     bench.folder.mkdir()
-    told = bench.acknowledged("hold", release=True)
-    assert (told.code, told.durable) == ("released", True)
+    reported = bench.acknowledged("hold", release=True)
+    assert (reported.code, reported.durable) == ("released", True)
     assert bench.context.disk_writer.problem is None
     bench.restart()
     assert [entry.code for entry in bench.entries("command")][-2:] == ["held", "released"]
 
 
-def test_the_scribe_notices_by_itself_that_the_folder_is_another_one(tmp_path: Path) -> None:
+def test_the_disk_writer_notices_by_itself_that_the_folder_is_another_one(tmp_path: Path) -> None:
     """Also when nobody notes anything; and once per time."""
-    folder, told = tmp_path / "state", list[str]()
+    folder, reported = tmp_path / "state", list[str]()
     folder.mkdir()
 
     class Book:
@@ -100,20 +100,20 @@ def test_the_scribe_notices_by_itself_that_the_folder_is_another_one(tmp_path: P
             self.written += 1
 
     first, last = Book(), Book()
-    scribe = DiskWriter(folder)
-    scribe.register(last, first)
-    scribe.register(last)
-    scribe.on_replaced(told.append)
-    scribe.check_folder()
-    scribe.write_due()
-    assert (first.written, last.written, scribe.has_written()) == (0, 0, True)
+    disk_writer = DiskWriter(folder)
+    disk_writer.register(last, first)
+    disk_writer.register(last)
+    disk_writer.on_replaced(reported.append)
+    disk_writer.check_folder()
+    disk_writer.write_due()
+    assert (first.written, last.written, disk_writer.has_written()) == (0, 0, True)
     for time in (1, 2):
         remove(folder, "made again")
-        scribe.check_folder()
-        assert not scribe.has_written()
-        scribe.write_due()
-        assert (first.written, last.written, scribe.has_written(), len(told)) == (time, time, True, time)
-    assert list(scribe._registered) == [first, last]
+        disk_writer.check_folder()
+        assert not disk_writer.has_written()
+        disk_writer.write_due()
+        assert (first.written, last.written, disk_writer.has_written(), len(reported)) == (time, time, True, time)
+    assert list(disk_writer._registered) == [first, last]
 
 
 def test_what_is_written_while_the_folder_is_replaced_is_written_again(tmp_path: Path) -> None:
@@ -127,14 +127,14 @@ def test_what_is_written_while_the_folder_is_replaced_is_written_again(tmp_path:
                 (tmp_path / "done").touch()
                 remove(folder, "made again")
 
-    scribe = DiskWriter(folder)
-    scribe.write(Book())
-    scribe.write_due()
+    disk_writer = DiskWriter(folder)
+    disk_writer.write(Book())
+    disk_writer.write_due()
     assert not (folder / "book").exists()
-    assert not scribe.has_written()
-    scribe.write_due()
+    assert not disk_writer.has_written()
+    disk_writer.write_due()
     assert (folder / "book").exists()
-    assert scribe.has_written()
+    assert disk_writer.has_written()
 
 
 def test_a_thread_writes_them_again_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -146,15 +146,15 @@ def test_a_thread_writes_them_again_soon(tmp_path: Path, monkeypatch: pytest.Mon
         def flush(self) -> None:
             written.set()
 
-    scribe = DiskWriter(folder)
-    scribe.register(Book())
-    scribe.thread.start()
+    disk_writer = DiskWriter(folder)
+    disk_writer.register(Book())
+    disk_writer.thread.start()
     try:
         remove(folder, "made again")
         wait_until(written.is_set, "the book")
     finally:
-        scribe.request_stop()
-        assert scribe.thread.join(20.0)
+        disk_writer.request_stop()
+        assert disk_writer.thread.join(20.0)
 
 
 def test_a_baseline_that_somebody_removed_is_written_again(tmp_path: Path) -> None:
@@ -225,9 +225,9 @@ def test_no_book_is_open_to_other_users(tmp_path: Path) -> None:
         bench = PairBench(tmp_path / "state")
         save_baseline(bench.folder / BASELINES, a_baseline())
         bench.drive(BEGIN_S, DRIVE_END_S)
-        found = books(bench.folder)
-        assert {"lock", "state.json", "state.json.previous", BASELINES, "history-front.jsonl"} <= set(found)
-        assert any(name.startswith("evidence/") for name in found)
+        result = books(bench.folder)
+        assert {"lock", "state.json", "state.json.previous", BASELINES, "history-front.jsonl"} <= set(result)
+        assert any(name.startswith("evidence/") for name in result)
         # The recorder of this bench makes empty files for windows, by itself.
         shutil.rmtree(bench.folder / "windows")
         assert open_to_others(bench.folder) == []

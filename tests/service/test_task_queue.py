@@ -18,18 +18,18 @@ def test_what_nobody_waits_for_any_more_is_not_done() -> None:
     assert done == []
 
 
-def test_what_was_begun_in_time_is_waited_for() -> None:
-    begun, go_on = threading.Event(), threading.Event()
+def test_what_was_started_in_time_is_waited_for() -> None:
+    started, go_on = threading.Event(), threading.Event()
 
     def work() -> str:
-        begun.set()
+        started.set()
         assert go_on.wait(10.0)
         return "done"
 
     handed = DeferredCall(work)
     other = threading.Thread(target=handed.run)
     other.start()
-    assert begun.wait(10.0)
+    assert started.wait(10.0)
     waits = threading.Timer(0.0, go_on.set)
     waits.start()
     assert handed.result(10.0) == "done"
@@ -37,7 +37,7 @@ def test_what_was_begun_in_time_is_waited_for() -> None:
     waits.join()
 
 
-def test_what_the_work_raises_is_raised_where_it_was_asked_for() -> None:
+def test_what_the_work_raises_is_raised_where_it_was_requested() -> None:
     handed = DeferredCall(lambda: 1 // 0)
     handed.run()
     with pytest.raises(ZeroDivisionError):
@@ -47,7 +47,7 @@ def test_what_the_work_raises_is_raised_where_it_was_asked_for() -> None:
 @pytest.mark.fault("a flood of `calibrate`", "it is refused, and pairing is not held up")
 def test_a_flood_of_commands_is_refused_and_answers_are_not_held_up() -> None:
     mailbox = TaskQueue()
-    asking = [threading.Thread(target=_asked, args=(mailbox,)) for _ in range(COMMANDS_WAITING)]
+    asking = [threading.Thread(target=_requested, args=(mailbox,)) for _ in range(COMMANDS_WAITING)]
     for thread in asking:
         thread.start()
     while mailbox._commands < COMMANDS_WAITING:
@@ -64,5 +64,5 @@ def test_a_flood_of_commands_is_refused_and_answers_are_not_held_up() -> None:
     assert mailbox._commands == 0
 
 
-def _asked(mailbox: TaskQueue) -> None:
+def _requested(mailbox: TaskQueue) -> None:
     mailbox.call_and_wait(lambda: None, 30.0)

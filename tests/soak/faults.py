@@ -139,19 +139,19 @@ def disk_slow(bench: Bench) -> None:
 
 def commands(bench: Bench) -> None:
     """A flood of them from many senders."""
-    ended = threading.Semaphore(0)
+    finished = threading.Semaphore(0)
 
     def count(reply: Any) -> None:
-        told = "answered" if reply.ok is not None else "refused"
-        bench.answers[told] = bench.answers.get(told, 0) + 1
+        reported = "answered" if reply.ok is not None else "refused"
+        bench.answers[reported] = bench.answers.get(reported, 0) + 1
 
     names = ("calibrate", "hold", "reset", "rollback", "commission", "apply")
     for number in range(COMMANDS):
         key = bench.keys.command(bench.pair, names[number % len(names)])
-        handler = zenoh.handlers.Callback(count, ended.release, indirect=False)
+        handler = zenoh.handlers.Callback(count, finished.release, indirect=False)
         bench.session.get(key, handler, payload=b"{}", attachment=f"sender {number % 40}".encode(), timeout=10.0)
     for _ in range(COMMANDS):
-        ended.acquire(timeout=20.0)
+        finished.acquire(timeout=20.0)
     bench.session.get(bench.keys.command(bench.pair, "hold"), payload=b'{"release":true}')
 
 

@@ -60,8 +60,10 @@ def accounted(counters: Any, sent: Counter[str], stream: str) -> tuple[int, int]
 def frames_accounted(counters: Any, stream: str) -> tuple[int, int]:
     """Frames that were made, and those that are part of a pair or lost by a cause of the pairing."""
     losses = counters[stream]["losses"]
-    ended = sum(losses.get(cause, 0) for cause in ("unpaired", "surplus", "stamp_back", "stamp_ahead", "memory_full"))
-    return counters[stream]["accepted"], counters["pairs"] + ended
+    finished = sum(
+        losses.get(cause, 0) for cause in ("unpaired", "surplus", "stamp_back", "stamp_ahead", "memory_full")
+    )
+    return counters[stream]["accepted"], counters["pairs"] + finished
 
 
 def soak(folder: Path, seconds: float, scale: float, seed: int) -> dict[str, Any]:
@@ -151,10 +153,10 @@ def _account(running: Service, vehicle: Vehicle) -> dict[str, Any]:
 
 def check(figures: dict[str, Any]) -> None:
     print(f"\n{json.dumps(figures, indent=1)}")
-    for sent, told in figures["messages"].values():
-        assert told == sent, figures
-    for made, told in figures["frames"].values():
-        assert told == made, figures
+    for sent, reported in figures["messages"].values():
+        assert reported == sent, figures
+    for made, reported in figures["frames"].values():
+        assert reported == made, figures
     assert set(figures["faults"]) == {fault.__name__ for fault in faults.ALL}
     assert not {"history_damaged", "state_damaged"} & set(figures["reasons"]), figures["reasons"]
     assert figures["commands"].get("answered", 0) > 0

@@ -62,10 +62,10 @@ class World:
 
     def __init__(self, folder: Path, nominal: Callable[[str], NominalStatus]) -> None:
         self.published: list[tuple[str, Answer]] = []
-        self.troubles: tuple[Reason, ...] = ()
+        self.problems: tuple[Reason, ...] = ()
         self.topics = RosTopicList()
         nothing = cast("Any", None)
-        self.outside = VehicleContext(
+        self.context = VehicleContext(
             Keys("coec", "vehicle"),
             nothing,
             nothing,
@@ -75,7 +75,7 @@ class World:
             nothing,
             nothing,
             lambda key, answer: self.published.append((key, answer)),
-            lambda: self.troubles,
+            lambda: self.problems,
             lambda *_: None,
             lambda: self.topics,
             nominal,

@@ -16,38 +16,38 @@ TIMEOUT_S = 20.0
 
 
 @dataclass
-class KeptTopic:
+class RetainedTopic:
     """`RosPublisher`, without a session."""
 
     type_name: str
     qos: Qos
     has_subscribers: bool = True
     closed: bool = False
-    _came: queue.SimpleQueue[Any] = field(default_factory=queue.SimpleQueue)
+    _received: queue.SimpleQueue[Any] = field(default_factory=queue.SimpleQueue)
 
     def put(self, payload: bytes, source_ns: int) -> None:
         assert not self.closed
         assert source_ns > 0
-        self._came.put(_STORE.deserialize_cdr(payload, self.type_name))
+        self._received.put(_STORE.deserialize_cdr(payload, self.type_name))
 
     def next(self) -> Any:
         """The next message, decoded by a reader that is not ours; waits for it."""
-        return self._came.get(timeout=TIMEOUT_S)
+        return self._received.get(timeout=TIMEOUT_S)
 
     def rest(self) -> Sequence[Any]:
         """Whatever else has come."""
-        return [self._came.get() for _ in range(self._came.qsize())]
+        return [self._received.get() for _ in range(self._received.qsize())]
 
 
 @dataclass
-class KeptTopics:
+class RetainedTopics:
     """`RosPublishers`, without a session."""
 
-    topics: dict[str, KeptTopic] = field(default_factory=dict)
+    topics: dict[str, RetainedTopic] = field(default_factory=dict)
 
-    def publisher(self, topic: str, type_name: str, qos: Qos) -> KeptTopic:
+    def publisher(self, topic: str, type_name: str, qos: Qos) -> RetainedTopic:
         assert topic not in self.topics
-        self.topics[topic] = KeptTopic(type_name, qos)
+        self.topics[topic] = RetainedTopic(type_name, qos)
         return self.topics[topic]
 
     def close(self) -> None:

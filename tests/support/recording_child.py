@@ -47,35 +47,35 @@ def recorder_of(
     windows: WindowStore, snippets: SnippetStore, recorded: list[str]
 ) -> tuple[Recorder, SnippetRecorder, LossCounter]:
     losses = LossCounter(logging.getLogger("test"), "front")
-    beside = SnippetRecorder(RIG, {"vehicle": "test"}, snippets, losses, packed=True)
-    ended = recorded.append
-    return Recorder(PLAN, windows, losses, lambda name, *_: ended(name), ended, beside), beside, losses
+    neighbour = SnippetRecorder(RIG, {"vehicle": "test"}, snippets, losses, packed=True)
+    finished = recorded.append
+    return Recorder(PLAN, windows, losses, lambda name, *_: finished(name), finished, neighbour), neighbour, losses
 
 
 def run(folder: Path, life: int) -> None:
     windows, snippets = stores(folder)
-    ended: list[str] = []
-    recorder, beside, _ = recorder_of(windows, snippets, ended)
+    finished: list[str] = []
+    recorder, neighbour, _ = recorder_of(windows, snippets, finished)
     recorder.thread.start()
-    said: set[str] = set()
+    reported: set[str] = set()
     for number in itertools.count(1):
         begin_ns = (1_700_000_000 + life * 1_000_000 + number * 10) * S
-        name, before = f"front-{begin_ns}", len(ended)
+        name, before = f"front-{begin_ns}", len(finished)
         pairs = [pair(begin_ns + index) for index in range(PAIRS)]
         for one in pairs:
             recorder.add(name, one, NOMINAL)
         recorder.end(SliceClosed(name, PAIRS, True))
-        beside.submit(
+        neighbour.submit(
             Snippet("suspect", begin_ns, NOMINAL, tuple(frame for one in pairs for frame in (one.lidar, one.camera)))
         )
-        wait_until(lambda: len(ended) > before, "the end of the window")  # noqa: B023 - called at once
+        wait_until(lambda: len(finished) > before, "the end of the window")  # noqa: B023 - called at once
         for info in windows.listing("front"):
-            if info.window_id not in said and info.sha256 is not None:
-                said.add(info.window_id)
+            if info.window_id not in reported and info.sha256 is not None:
+                reported.add(info.window_id)
                 print(f"window {info.window_id} {info.sha256}", flush=True)
         for snippet in snippets.listing("front"):
-            if snippet.snippet_id not in said:
-                said.add(snippet.snippet_id)
+            if snippet.snippet_id not in reported:
+                reported.add(snippet.snippet_id)
                 print(f"snippet {snippet.snippet_id} {snippet.sha256}", flush=True)
 
 

@@ -210,13 +210,17 @@ def sweep_in_frame(sweep: LidarFrame, T_frame_lidar: NDArray[np.float64]) -> Lid
 
 Array = NDArray[np.float64]
 
-NO_SIGHT_LINES = PointsInView(np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
+NO_WINDOW_DATA_LINES = PointsInView(np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
 
 
 def landscape(score: Callable[[Array], Array], axes: int = 3, step_rad: float = 1e-3) -> Landscape:
     """Of cells (F, B) as a function of the perturbation (6,), about no perturbation."""
     return Landscape.about(
-        Cells(lambda poses: np.array([score(se3.perturbation_log(pose)) for pose in poses]), step_rad, NO_SIGHT_LINES),
+        Cells(
+            lambda poses: np.array([score(se3.perturbation_log(pose)) for pose in poses]),
+            step_rad,
+            NO_WINDOW_DATA_LINES,
+        ),
         np.eye(4),
         tuple(range(axes)),
     )

@@ -79,8 +79,8 @@ def a_window(
     path: Path, pairs: list[FramePair] | None = None, rig: Rig | None = None, *, packed: bool = False
 ) -> RecordedWindow:
     rig = rig or a_rig()
-    said = {"vehicle": "car"}
-    writer = WindowWriter(path, rig, rig.T_camera_lidar_nominal, path.stem, CONFIGURATION, said, packed=packed)
+    reported = {"vehicle": "car"}
+    writer = WindowWriter(path, rig, rig.T_camera_lidar_nominal, path.stem, CONFIGURATION, reported, packed=packed)
     for pair in pairs if pairs is not None else [a_pair(i) for i in range(3)]:
         writer.add(pair)
     return writer.finish()

@@ -11,19 +11,19 @@ def maybe(*places: str) -> Any:
     for place in places:
         module, _, name = place.partition(":")
         try:
-            found = import_module(module)
+            result = import_module(module)
         except ModuleNotFoundError:
             continue
         if not name:
-            return found
-        if hasattr(found, name):
-            return getattr(found, name)
+            return result
+        if hasattr(result, name):
+            return getattr(result, name)
     return None
 
 
 def first_of(*places: str) -> Any:
     """Likewise, of something that every version has."""
-    found = maybe(*places)
-    if found is None:
+    result = maybe(*places)
+    if result is None:
         raise ImportError(f"this version has none of {', '.join(places)}")
-    return found
+    return result

@@ -59,7 +59,7 @@ def pair_read(store: Any, folder: Path, name: str, rig_document: Any) -> dict[st
         "accepted": state.accepted is not None,
         "evidence": state.monitor.evidence,
         "damage": books.damage,
-        "history": [kept.entry.text for kept in books.entries()],
+        "history": [retained.entry.text for retained in books.entries()],
         "results": len(books.results()),
         "windows_of_events": sorted(Incidents(folder / "evidence", name, 4).window_ids),
     }
@@ -67,15 +67,15 @@ def pair_read(store: Any, folder: Path, name: str, rig_document: Any) -> dict[st
 
 def read(folder: Path, expected: dict[str, Any]) -> dict[str, Any]:
     store = StateStore(folder, "shuttle-7")
-    told: dict[str, Any] = {
+    reported: dict[str, Any] = {
         "damage": list(store.damage),
         "pairs": {name: pair_read(store, folder, name, pair["rig"]) for name, pair in expected["pairs"].items()},
     }
     try:
-        told["baseline"] = baseline_file.load_baseline(folder / baseline_file.BASELINES, "front") is not None
+        reported["baseline"] = baseline_file.load_baseline(folder / baseline_file.BASELINES, "front") is not None
     except Exception as error:  # likewise
-        told["baseline"] = f"{type(error).__name__}: {error}"
-    return told
+        reported["baseline"] = f"{type(error).__name__}: {error}"
+    return reported
 
 
 if __name__ == "__main__":

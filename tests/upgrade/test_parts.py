@@ -239,7 +239,7 @@ def test_a_hold_that_cannot_be_read_holds() -> None:
 
 
 @pytest.mark.fault("a state whose extrinsic cannot be read", "nominal is served, and hold and history are kept")
-def test_without_the_extrinsic_hold_and_history_are_kept() -> None:
+def test_without_the_extrinsic_hold_and_history_are_retained() -> None:
     seed = SEEDS["held and healthy"]
     remembered = damaged(seed, "T_camera_lidar", "x")
     assert np.array_equal(remembered.state.T_camera_lidar, seed.rig.T_camera_lidar_nominal)
@@ -266,7 +266,7 @@ def test_health_is_no_better_than_the_rest_of_the_state_allows(
     assert read(seed, seed.document | change).state.health is expected
 
 
-def test_of_a_monitor_that_cannot_be_read_what_accuses_is_kept() -> None:
+def test_of_a_monitor_that_cannot_be_read_what_accuses_is_retained() -> None:
     document = SEEDS["miscalibrated"].document
     document["monitor"] |= {"turned": "x", "blind": {"lens_dirty": 2.0}}
     monitor = read(SEEDS["miscalibrated"], document).state.monitor
@@ -333,7 +333,7 @@ def written(folder: Path, documents: dict[str, object]) -> None:
     StateFile(folder / STATE_FILE).save({"pairs": documents})
 
 
-def test_two_pairs_that_lose_parts_set_one_file_aside(tmp_path: Path) -> None:
+def test_two_pairs_that_lose_parts_set_one_file_offset(tmp_path: Path) -> None:
     front, rear = SEEDS["held and healthy"].document, SEEDS["miscalibrated"].document
     front["versions"]["monitor"], rear["track"] = 99, "x"
     written(tmp_path, {"front": front, "rear": rear})
@@ -351,7 +351,7 @@ def test_two_pairs_that_lose_parts_set_one_file_aside(tmp_path: Path) -> None:
 @pytest.mark.fault(
     "a step back from a version that knows more of a pair", "all else is read, and its file is kept aside"
 )
-def test_a_file_with_fields_of_a_newer_version_is_kept_aside(tmp_path: Path) -> None:
+def test_a_file_with_fields_of_a_newer_version_is_quarantined(tmp_path: Path) -> None:
     seed = SEEDS["held and healthy"]
     written(tmp_path, {"front": seed.document | {"towed": {"by": "a lorry"}}})
     before = (tmp_path / STATE_FILE).read_bytes()
@@ -364,7 +364,7 @@ def test_a_file_with_fields_of_a_newer_version_is_kept_aside(tmp_path: Path) -> 
     assert (tmp_path / f"{STATE_FILE}.newer").read_bytes() == before
 
 
-def test_programs_beside_the_service_read_the_pairs_that_can_be_read(tmp_path: Path) -> None:
+def test_programs_next_to_the_service_read_the_pairs_that_can_be_read(tmp_path: Path) -> None:
     front, rear = SEEDS["held and healthy"].document, SEEDS["miscalibrated"].document
     written(tmp_path, {"front": front | {"monitor": 3}, "rear": rear | {"T_camera_lidar": 3}, "": 3})
     ((pair, (_, state)),) = read_pairs(tmp_path).items()

@@ -74,7 +74,7 @@ class OldResult(Old):
     systematic: dict[str, Six]
     correlation_pitch_height: float | None
     correlation_yaw_side: float | None
-    independent_looks: float | None
+    independent_observations: float | None
     solved: Flags6
     unobservable: Flags6
     status: Literal["not_accepted", "accepted", "failed"]
@@ -94,7 +94,7 @@ class OldResult(Old):
     config_hash: str
 
 
-class OldBelief(Old):
+class OldPosterior(Old):
     mean: Three
     variance: Three
     astray: float = 0.0
@@ -104,12 +104,12 @@ class OldHypothesis(Old):
     kind: int
     age: float
     evidence: float
-    moved: OldBelief
-    right: OldBelief
+    moved: OldPosterior
+    right: OldPosterior
 
 
 class OldHypotheses(Old):
-    right: OldBelief | None
+    right: OldPosterior | None
     running: tuple[OldHypothesis, ...]
     before: Three | None
 
@@ -233,20 +233,20 @@ def body(path: Path) -> dict[str, Any]:
     "a step back to an earlier version of the software", "it finds every field that it requires, in the form it knows"
 )
 def test_an_earlier_version_finds_what_it_requires(now: tuple[Path, dict[str, Any]]) -> None:
-    folder, told = now
+    folder, reported = now
     pairs = body(folder / "state.json")["pairs"]
-    assert set(pairs) == set(told["pairs"])
+    assert set(pairs) == set(reported["pairs"])
     for pair, document in pairs.items():
         stored = OldPair.model_validate_json(json.dumps(document))
-        assert [list(row) for row in stored.T_camera_lidar] == told["pairs"][pair]["T_camera_lidar"]
-        assert stored.frozen == told["pairs"][pair]["is_held"]
+        assert [list(row) for row in stored.T_camera_lidar] == reported["pairs"][pair]["T_camera_lidar"]
+        assert stored.frozen == reported["pairs"][pair]["is_held"]
         assert stored.monitor.turned.running
     for edge in body(folder / "sensors.json")["edges"].values():
         OldEdge.model_validate_json(json.dumps(edge))
 
 
 def test_an_earlier_version_verifies_the_history(now: tuple[Path, dict[str, Any]]) -> None:
-    folder, told = now
+    folder, reported = now
     texts = []
     for path in sorted(folder.glob("*-front.jsonl")):
         if path.name.startswith("checks"):
@@ -257,7 +257,7 @@ def test_an_earlier_version_verifies_the_history(now: tuple[Path, dict[str, Any]
             texts.append((entry.sequence, entry.text))
             if entry.result_sha256 is not None:
                 OldResult.model_validate_json(result)
-    assert [text for _, text in sorted(texts)] == told["pairs"]["front"]["history"]
+    assert [text for _, text in sorted(texts)] == reported["pairs"]["front"]["history"]
 
 
 def test_an_earlier_version_reads_the_baseline(now: tuple[Path, dict[str, Any]]) -> None:
@@ -301,10 +301,10 @@ def sources_of(commit: str, folder: Path) -> Path:
 def test_an_earlier_version_reads_what_this_one_wrote(
     now: tuple[Path, dict[str, Any]], commit: str, tmp_path: Path
 ) -> None:
-    folder, told = now
+    folder, reported = now
     sources = sources_of(commit, tmp_path / "old")
     shutil.copytree(folder, tmp_path / "state")
-    (tmp_path / "expected.json").write_text(json.dumps(told), encoding="utf-8")
+    (tmp_path / "expected.json").write_text(json.dumps(reported), encoding="utf-8")
     script = Path(__file__).with_name("read_state.py")
     read = subprocess.run(
         [sys.executable, str(script), str(tmp_path / "state"), str(tmp_path / "expected.json")],
@@ -315,16 +315,16 @@ def test_an_earlier_version_reads_what_this_one_wrote(
     )
     back = json.loads(read.stdout)
     assert back["damage"] == []
-    for pair, expected in told["pairs"].items():
-        found = back["pairs"][pair]
-        assert found.get("error") is None
-        assert found["T_camera_lidar"] == expected["T_camera_lidar"]
-        assert (found["provenance"], found["accepted"]) == ("restored", True)
-        assert found["is_held"] == expected["is_held"]
+    for pair, expected in reported["pairs"].items():
+        detected = back["pairs"][pair]
+        assert detected.get("error") is None
+        assert detected["T_camera_lidar"] == expected["T_camera_lidar"]
+        assert (detected["provenance"], detected["accepted"]) == ("restored", True)
+        assert detected["is_held"] == expected["is_held"]
         if commit in KEEPS_WHO_HOLDS:
-            assert found["hold"] == expected["hold"]
-        assert (found["damage"], found["history"], found["results"]) == (None, expected["history"], 1)
-        assert found["windows_of_events"] == [f"{pair}-1"]
-        assert found["health"] == ("unknown" if expected["health"] == "healthy" else expected["health"])
-        assert found["evidence"] == expected["evidence"]
+            assert detected["hold"] == expected["hold"]
+        assert (detected["damage"], detected["history"], detected["results"]) == (None, expected["history"], 1)
+        assert detected["windows_of_events"] == [f"{pair}-1"]
+        assert detected["health"] == ("unknown" if expected["health"] == "healthy" else expected["health"])
+        assert detected["evidence"] == expected["evidence"]
     assert (back["baseline"] is True) == (commit not in REFUSES_BASELINE)

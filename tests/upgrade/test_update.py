@@ -57,10 +57,10 @@ class Vehicle:
         self.commit = commit
         self.folder = folder
         shutil.copytree(FIXTURES / commit / "state", folder)
-        self.told: dict[str, Any] = json.loads((FIXTURES / commit / "expected.json").read_text(encoding="utf-8"))
+        self.reported: dict[str, Any] = json.loads((FIXTURES / commit / "expected.json").read_text(encoding="utf-8"))
 
     def rig(self, pair: str) -> Rig:
-        return rig_from_json(self.told["pairs"][pair]["rig"], None)
+        return rig_from_json(self.reported["pairs"][pair]["rig"], None)
 
     def recalled(self, pair: str) -> RestoredPair:
         remembered = StateStore(self.folder, VEHICLE).load(self.rig(pair))
@@ -98,35 +98,35 @@ def test_there_is_a_directory_of_every_commit_and_no_other() -> None:
     "wrote them",
 )
 def test_an_update_keeps_the_calibration_and_the_hold(vehicle: Vehicle) -> None:
-    for pair, told in vehicle.told["pairs"].items():
+    for pair, reported in vehicle.reported["pairs"].items():
         remembered = vehicle.recalled(pair)
         state = remembered.state
         assert {lost.part for lost in remembered.lost} == LOST[vehicle.commit], pair
         assert {lost.written_by for lost in remembered.lost} <= {"older"}
-        np.testing.assert_array_equal(state.T_camera_lidar, told["T_camera_lidar"])
+        np.testing.assert_array_equal(state.T_camera_lidar, reported["T_camera_lidar"])
         assert (state.provenance, state.status, state.valid_from_ns) == (
-            told["provenance"],
-            told["status"],
-            told["valid_from_ns"],
+            reported["provenance"],
+            reported["status"],
+            reported["valid_from_ns"],
         )
         if "accepted estimate" not in LOST[vehicle.commit]:
             assert state.accepted is not None
-            assert state.accepted.window_id == told["window_id"]
-        assert (state.hold is not None) == told["is_held"]
-        if told["hold"] is not None:
-            assert state.hold == ExtrinsicHold(7_000_000_000, *told["hold"])
-        if told["record"] is not None:
-            assert {name: getattr(state.record, name) for name in told["record"]} == told["record"]
-        assert list(remembered.commissioned_from) == told["commissioned_from"]
+            assert state.accepted.window_id == reported["window_id"]
+        assert (state.hold is not None) == reported["is_held"]
+        if reported["hold"] is not None:
+            assert state.hold == ExtrinsicHold(7_000_000_000, *reported["hold"])
+        if reported["record"] is not None:
+            assert {name: getattr(state.record, name) for name in reported["record"]} == reported["record"]
+        assert list(remembered.commissioned_from) == reported["commissioned_from"]
         assert remembered.clocks.completed_stamp_ns == 8_000_000_000
 
 
 @pytest.mark.fault("an update of the software", "nothing is green that was not, and a miscalibrated pair stays so")
 def test_an_update_makes_nothing_green(vehicle: Vehicle) -> None:
     front, rear = (restored(vehicle.recalled(pair).state) for pair in ("front", "rear"))
-    assert vehicle.told["pairs"]["front"]["health"] == "healthy"
+    assert vehicle.reported["pairs"]["front"]["health"] == "healthy"
     assert front.health is HealthState.UNKNOWN
-    assert vehicle.told["pairs"]["rear"]["outcome"] == "confirmed"
+    assert vehicle.reported["pairs"]["rear"]["outcome"] == "confirmed"
     assert rear.health is HealthState.MISCALIBRATED
     assert rear.monitor.outcome is MonitorOutcome.CONFIRMED
 
@@ -148,10 +148,10 @@ def test_a_monitor_without_its_evidence_does_not_acquit(vehicle: Vehicle) -> Non
 
 @pytest.mark.fault("an update of the software", "the history is kept and verified, and goes on")
 def test_an_update_keeps_the_history(vehicle: Vehicle) -> None:
-    for pair, told in vehicle.told["pairs"].items():
+    for pair, reported in vehicle.reported["pairs"].items():
         books = PairHistory(vehicle.folder, pair, 1000, vehicle.recalled(pair).history_heads)
         assert books.damage is None
-        assert [kept.entry.text for kept in books.entries()] == told["history"]
+        assert [retained.entry.text for retained in books.entries()] == reported["history"]
         assert Incidents(vehicle.folder / "evidence", pair, 4).window_ids == {f"{pair}-1"}
 
 
@@ -164,45 +164,45 @@ def test_a_history_that_was_cut_off_is_noticed_by_the_head_of_an_earlier_version
 
 
 @pytest.mark.fault("an update of the software", "baselines, the rig and calibrations found on the bus are kept")
-def test_an_update_keeps_what_stands_beside_the_state(vehicle: Vehicle) -> None:
+def test_an_update_keeps_what_stands_next_to_the_state(vehicle: Vehicle) -> None:
     baseline = load_baseline(vehicle.folder / BASELINES, "front")
     assert baseline is not None
     if vehicle.commit not in OTHER_FIGURES:
-        assert baseline_hash(baseline) == vehicle.told["baseline"]
+        assert baseline_hash(baseline) == vehicle.reported["baseline"]
         assert baseline.config_hash == learned_hash(CalibrationConfig()), (
             "a setting of the objective or of the search that is added changes the hash, and drops every baseline"
         )
     rig = RigStore(vehicle.folder)
     assert rig.damage == ()
-    assert sorted(rig._edges) == vehicle.told["edges"]
-    if vehicle.told["nominal"]:
-        found = DiscoveryStore(vehicle.folder).load(Config.model_validate(vehicle.told["nominal"]))
-        assert found["side"].pair.T_camera_lidar[2][3] == -0.7
+    assert sorted(rig._edges) == vehicle.reported["edges"]
+    if vehicle.reported["nominal"]:
+        result = DiscoveryStore(vehicle.folder).load(Config.model_validate(vehicle.reported["nominal"]))
+        assert result["side"].pair.T_camera_lidar[2][3] == -0.7
 
 
 @pytest.mark.fault(
     "a state in which a part has the form of another version",
     "health, log, loss count and history name the part, and the file is kept aside",
 )
-def test_what_is_dropped_is_said_counted_and_kept_aside(vehicle: Vehicle) -> None:
+def test_what_is_dropped_is_reported_counted_and_quarantined(vehicle: Vehicle) -> None:
     written = (vehicle.folder / "state.json").read_bytes()
     store, losses = vehicle.store("front")
-    np.testing.assert_array_equal(store.served.T_camera_lidar, vehicle.told["pairs"]["front"]["T_camera_lidar"])
+    np.testing.assert_array_equal(store.served.T_camera_lidar, vehicle.reported["pairs"]["front"]["T_camera_lidar"])
     lost = LOST[vehicle.commit]
     assert losses.snapshot() == ({("storage", "state_older"): len(lost)} if lost else {})
-    noted = [kept.entry for kept in store.history.entries() if kept.entry.kind == "chain"]
-    aside = vehicle.folder / "state.json.older"
+    noted = [retained.entry for retained in store.history.entries() if retained.entry.kind == "chain"]
+    offset = vehicle.folder / "state.json.older"
     if not lost:
         assert store.damage is None
         assert not noted
-        assert not aside.exists()
+        assert not offset.exists()
         return
     assert store.damage is not None
     assert store.damage.code == "state_other_version"
     assert all(f"{part} (written by an older version" in store.damage.text for part in lost)
     assert "disk" not in store.damage.text.replace("state on the disk", "")
     assert [(entry.code, entry.text) for entry in noted] == [(store.damage.code, store.damage.text)]
-    assert aside.read_bytes() == written
+    assert offset.read_bytes() == written
     again, losses = vehicle.store("front")
     assert again.damage is None, "the next start finds a state of this version"
     assert losses.snapshot() == {}
@@ -210,8 +210,8 @@ def test_what_is_dropped_is_said_counted_and_kept_aside(vehicle: Vehicle) -> Non
     assert again.state.hold == store.state.hold
 
 
-def test_programs_beside_the_service_read_what_it_would_serve(vehicle: Vehicle) -> None:
+def test_programs_next_to_the_service_read_what_it_would_serve(vehicle: Vehicle) -> None:
     pairs = read_pairs(vehicle.folder)
     assert set(pairs) == {"front", "rear"}
     for pair, (_, state) in pairs.items():
-        np.testing.assert_array_equal(state.T_camera_lidar, vehicle.told["pairs"][pair]["T_camera_lidar"])
+        np.testing.assert_array_equal(state.T_camera_lidar, vehicle.reported["pairs"][pair]["T_camera_lidar"])

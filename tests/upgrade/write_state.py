@@ -150,7 +150,7 @@ def write_history(folder: Path, rig: Rig, state: PairState) -> tuple[Any, list[s
     append("commissioned", "commissioned", "From 2 windows.")
     if hasattr(books, "flush"):
         books.flush()
-    return books, [kept.entry.text for kept in books.entries()]
+    return books, [retained.entry.text for retained in books.entries()]
 
 
 def write_evidence(folder: Path, rig: Rig, state: PairState) -> str:
@@ -199,7 +199,7 @@ def write_nominal(folder: Path) -> dict[str, Any]:
     store = names.maybe("coec.service.discovery:DiscoveryStore", "coec.runtime.nominal.kept:KeptNominals")
     if store is None:
         return {}
-    found = names.first_of("coec.service.discovery:DiscoveredPair", "coec.runtime.nominal.findings:Found")
+    detected = names.first_of("coec.service.discovery:DiscoveredPair", "coec.runtime.nominal.findings:Found")
     pair_config = names.first_of("coec.config:PairConfig")
     configured = {"middleware": "rmw_zenoh", "pairs": [{"name": "side", "camera": "/side/image", "points": "/top"}]}
     config = Config.model_validate(configured)
@@ -214,7 +214,7 @@ def write_nominal(folder: Path) -> dict[str, Any]:
         "T_camera_lidar": [[0.0, -1.0, 0.0, 0.1], [0.0, 0.0, -1.0, 0.2], [1.0, 0.0, 0.0, -0.7], [0.0, 0.0, 0.0, 1.0]],
     }
     book = store(folder)
-    discovered = found(pair_config.model_validate(document), {"T_camera_lidar": "/tf_static"})
+    discovered = detected(pair_config.model_validate(document), {"T_camera_lidar": "/tf_static"})
     method(book, "update", "keep")(discovered, config.awaited[0], config, S)
     book.flush()
     return configured
@@ -225,15 +225,15 @@ def write(folder: Path) -> dict[str, Any]:
     folder.mkdir(parents=True, exist_ok=True)
     store = StateStore(folder, VEHICLE)
     update = method(store, "update", "remember")
-    told: dict[str, Any] = {"nominal": write_nominal(folder), "edges": write_rig_file(folder), "pairs": {}}
+    reported: dict[str, Any] = {"nominal": write_nominal(folder), "edges": write_rig_file(folder), "pairs": {}}
     for rig, (state, made) in ((FRONT, front_state()), (REAR, rear_state())):
         books, texts = write_history(folder, rig, state)
         heads = books.durable_heads if hasattr(books, "durable_heads") else books.durable_head
         by_call = "Callable" in str(inspect.signature(update).parameters.get("history_heads"))
         clocks = Clocks(6 * S, 8 * S, 4 * S)
         more = {"commissioned_from": (f"{rig.pair}-1",)}
-        given(update, rig, state, clocks, (lambda kept=heads: kept) if by_call else heads, **more)
-        told["pairs"][rig.pair] = {
+        given(update, rig, state, clocks, (lambda retained=heads: retained) if by_call else heads, **more)
+        reported["pairs"][rig.pair] = {
             "rig": rig_to_json(rig),
             "T_camera_lidar": state.T_camera_lidar.tolist(),
             "provenance": state.provenance.value,
@@ -260,7 +260,7 @@ def write(folder: Path) -> dict[str, Any]:
         store.flush()
     baseline = replace(a_baseline(), config_hash=learned_hash(CalibrationConfig()))
     baseline_file.save_baseline(folder / baseline_file.BASELINES, baseline)
-    return told | {"baseline": baseline_file.baseline_hash(baseline), "learned": baseline.config_hash}
+    return reported | {"baseline": baseline_file.baseline_hash(baseline), "learned": baseline.config_hash}
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ class TestAccuracy:
         assert self.accuracy.distance2(offset, 4) == pytest.approx(27.0)
         assert self.accuracy.farthest2(offset, 4) == pytest.approx(9.0)
 
-    def test_more_pairs_tell_more_but_not_more_than_the_bias(self) -> None:
+    def test_more_pairs_determine_more_but_not_more_than_the_bias(self) -> None:
         assert self.accuracy.sigma(16)[0] < self.accuracy.sigma(4)[0]
         assert self.accuracy.sigma(10**9)[0] > 0.001
 
@@ -44,9 +44,9 @@ class TestBaseline:
     def test_drift_of_the_commissioned_pose_is_nothing(self) -> None:
         baseline = a_baseline()
         sigma = np.full(6, 0.002)
-        found = drift(se3.perturb(baseline.T_camera_lidar, baseline.bias), sigma, baseline)
-        np.testing.assert_allclose(found.value, 0.0, atol=1e-12)
-        assert (found.sigma[:3] > 0.002).all()
+        result = drift(se3.perturb(baseline.T_camera_lidar, baseline.bias), sigma, baseline)
+        np.testing.assert_allclose(result.value, 0.0, atol=1e-12)
+        assert (result.sigma[:3] > 0.002).all()
 
     def test_learned_limits_replace_configured_ones(self) -> None:
         limits = a_baseline().verdict(VerdictConfig())

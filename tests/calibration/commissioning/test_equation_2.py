@@ -35,8 +35,8 @@ def test_limits_of_nothing_refuse_nothing() -> None:
 @pytest.mark.parametrize("rate", [0.01, 0.1])
 def test_learned_limits_flag_about_the_stated_share_of_right_poses(rate: float) -> None:
     rng = np.random.default_rng(5)
-    drawn = rng.normal([1.0, 5.0, 100.0], [0.1, 1.0, 10.0], (40_000, 3))
-    right = [Figures(*row) for row in drawn.tolist()]
+    samples = rng.normal([1.0, 5.0, 100.0], [0.1, 1.0, 10.0], (40_000, 3))
+    right = [Figures(*row) for row in samples.tolist()]
     limits = PaperLimits.learned(right[:20_000], rate)
     flagged = np.mean([limits.flags(figures) for figures in right[20_000:]])
     assert flagged == pytest.approx(rate, rel=0.2)

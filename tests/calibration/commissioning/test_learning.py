@@ -110,7 +110,9 @@ class _Scripted:
         return _Scripted(self.says[list(indices)], self.rig)
 
 
-def test_spread_of_a_pair_is_found_from_checks_at_halves(sharp_street: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_spread_of_a_pair_is_detected_from_checks_at_halves(
+    sharp_street: Window, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Without bias: on the average of drives the variance is the true one and that of the prior, by their weights."""
     true = np.array([np.radians(0.3)] * 3 + [0.1] * 3)
 
@@ -135,10 +137,12 @@ def test_detection_learns_on_some_pairs_and_tries_others(
     sharp_street: Window, stereo: DepthModel, images: ImageReader
 ) -> None:
     evidence = gather(prepare_window_data(sharp_street, stereo, images, CONFIG, Silence()), commissioning.FAR_RAD)
-    heard: list[tuple[int, int]] = []
-    tried = try_detection(evidence, sharp_street.T_camera_lidar_start, CONFIG, 1, 2, lambda *step: heard.append(step))
+    received: list[tuple[int, int]] = []
+    tried = try_detection(
+        evidence, sharp_street.T_camera_lidar_start, CONFIG, 1, 2, lambda *step: received.append(step)
+    )
     rows = {row.name: row for row in table(tried)}
-    assert heard == [(1, 1)]
+    assert received == [(1, 1)]
     assert {"right", "0.5 deg", "1 deg", "3 deg"} <= set(rows)
     assert rows["3 deg"].flagged == 1.0
     assert all(row.checks == 2 for row in rows.values())
@@ -191,10 +195,10 @@ def test_limits_are_those_of_blocks_of_time_that_were_left_out(
     """Blocks that lie apart by more than pairs vary within them tell that other streets will lie apart, too."""
     rng = np.random.default_rng(5)
     noise = rng.normal(size=(48, 6)) * np.array([radians(0.1)] * 3 + [0.02] * 3)
-    apart = np.repeat(rng.normal(size=(4, 6)), 12, axis=0) * np.array([radians(0.5)] * 3 + [0.1] * 3)
+    separation = np.repeat(rng.normal(size=(4, 6)), 12, axis=0) * np.array([radians(0.5)] * 3 + [0.1] * 3)
     same = limits_of(noise, sharp_street.rig, monkeypatch)
-    other = limits_of(noise + apart, sharp_street.rig, monkeypatch)
-    mixed = limits_of(noise + apart[rng.permutation(48)], sharp_street.rig, monkeypatch)
+    other = limits_of(noise + separation, sharp_street.rig, monkeypatch)
+    mixed = limits_of(noise + separation[rng.permutation(48)], sharp_street.rig, monkeypatch)
     known_by = commissioning.PRIOR_BLOCKS + commissioning.BLOCKS - 1
     least = distance2_quantile(1.0 - FALSE_ALARM_RATE / 2.0, 3, known_by)
     assert same[0] >= least
@@ -215,6 +219,6 @@ class TestVerdictLimits:
         limits = learned([with_metrics(16.0, 0.4, 0.1)], [with_metrics(4.0, 0.9, 0.2)])
         assert limits == {"min_edge_contrast": pytest.approx(8.0), "max_runner_up": pytest.approx(0.6)}
 
-    def test_a_figure_that_does_not_tell_them_apart_has_none(self) -> None:
+    def test_a_figure_that_does_not_distinguish_them_has_none(self) -> None:
         near = [with_metrics(16.0, 0.4, 0.1), with_metrics(3.0, 0.5, 0.1)]
         assert set(learned(near, [with_metrics(4.0, 0.9, 0.2)])) == {"max_runner_up"}

@@ -73,11 +73,11 @@ def test_the_bias_of_a_further_vehicle_lies_where_the_model_says(count: int) -> 
     """Standard errors over many models that were drawn have the spread of Student's t, whose tails few vehicles make
     wide: the share within two is that of the distribution."""
     rng = np.random.default_rng(count)
-    apart = []
+    separation = []
     for _ in range(200):
         model = model_baseline([_vehicle(rng) for _ in range(count)])
-        apart.append((_vehicle(rng).pose.bias - model.pose.bias) / model.pose.bias_sigma)
-    within = float(np.mean(np.abs(np.array(apart)) < 2.0))
+        separation.append((_vehicle(rng).pose.bias - model.pose.bias) / model.pose.bias_sigma)
+    within = float(np.mean(np.abs(np.array(separation)) < 2.0))
     assert within == pytest.approx({3: 0.816, 8: 0.914, 30: 0.945}[count], abs=0.03)
 
 
@@ -119,6 +119,6 @@ def test_what_does_not_belong_together_is_refused(
         model_baseline([other, *vehicles[1:]])
 
 
-def test_two_vehicles_do_not_tell_how_they_differ(vehicles: list[Baseline]) -> None:
+def test_two_vehicles_do_not_show_how_they_differ(vehicles: list[Baseline]) -> None:
     with pytest.raises(CalibrationError, match="at least 3 vehicles"):
         model_baseline(vehicles[:2])

@@ -19,7 +19,7 @@ def test_chi_squared(probability: float, dof: int, value: float) -> None:
 
 
 @pytest.mark.parametrize("probability", [0.0, 1.0, -0.1, float("nan")])
-def test_outside_of_probabilities(probability: float) -> None:
+def test_beyond_probabilities(probability: float) -> None:
     with pytest.raises(ValueError, match="between 0 and 1"):
         normal_quantile(probability)
 
@@ -33,6 +33,6 @@ def test_distance_from_an_estimated_spread(probability: float, dof: int, known_b
     assert distance2_quantile(probability, dof, known_by) == pytest.approx(value, rel=0.03)
 
 
-def test_a_spread_that_two_draws_tell_has_no_rare_quantile() -> None:
+def test_a_spread_of_two_samples_has_no_rare_quantile() -> None:
     with pytest.raises(ValueError, match="2 degrees of freedom determine no quantile"):
         distance2_quantile(0.9999, 3, 2)

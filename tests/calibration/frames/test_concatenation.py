@@ -39,29 +39,29 @@ def noisy(seed: int) -> LidarFrame:
     "poses", [(ROOF_POSE, LEFT), (LEFT, RIGHT), (HERE, LEFT), (LEFT, HERE), (ROOF_POSE, LEFT, RIGHT)], ids=range(5)
 )
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_several_lidars_in_one_cloud_are_told_with_their_places(
+def test_several_lidars_in_one_cloud_are_reported_with_their_places(
     poses: tuple[NDArray[np.float64], ...], seed: int
 ) -> None:
-    found = apparent_origin(joined(*(sweep_in_frame(noisy(seed + n), T) for n, T in enumerate(poses))))
-    assert isinstance(found, SeveralOrigins)
-    np.testing.assert_allclose(found.origins_m, [T[:3, 3] for T in poses[:2]], atol=0.15)
-    assert "concatenated" in found.sentence
+    result = apparent_origin(joined(*(sweep_in_frame(noisy(seed + n), T) for n, T in enumerate(poses))))
+    assert isinstance(result, SeveralOrigins)
+    np.testing.assert_allclose(result.origins_m, [T[:3, 3] for T in poses[:2]], atol=0.15)
+    assert "concatenated" in result.sentence
 
 
 @pytest.mark.parametrize("share", [0.75, 0.5])
-def test_a_small_lidar_beside_the_one_of_the_frame_is_told(share: float) -> None:
+def test_a_small_lidar_next_to_the_one_of_the_frame_is_reported(share: float) -> None:
     cloud = joined(turning_sweep(1), thinned(sweep_in_frame(turning_sweep(2), LEFT), share))
     assert isinstance(apparent_origin(cloud), SeveralOrigins)
 
 
-def test_rings_of_their_own_numbers_are_told_too() -> None:
+def test_rings_of_their_own_numbers_are_reported_too() -> None:
     other = sweep_in_frame(turning_sweep(2), LEFT)
     assert other.ring is not None
     cloud = joined(sweep_in_frame(turning_sweep(1), ROOF_POSE), replace(other, ring=other.ring + np.uint16(16)))
     assert isinstance(apparent_origin(cloud), SeveralOrigins)
 
 
-def test_the_next_cloud_is_told_from_what_was_found() -> None:
+def test_the_next_cloud_is_distinguished_from_what_was_discovered() -> None:
     check = OriginCheck()
     for seed in range(3):
         cloud = joined(sweep_in_frame(noisy(seed), ROOF_POSE), sweep_in_frame(noisy(seed + 7), LEFT))

@@ -31,7 +31,7 @@ class Frame:
     value: int
 
 
-def test_an_image_is_decoded_once_for_both_looks_and_then_forgotten() -> None:
+def test_an_image_is_decoded_once_for_both_observations_and_then_forgotten() -> None:
     reader, frames = Counted(), [cast(CameraFrame, Frame(value)) for value in (7, 9)]
     once = CachedImages(reader)
     first = [once.first(frame) for frame in frames]
@@ -43,7 +43,7 @@ def test_an_image_is_decoded_once_for_both_looks_and_then_forgotten() -> None:
     assert reader.of_frame[id(frames[0])] == 2
 
 
-def test_no_more_is_kept_than_may_be_and_what_goes_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_more_is_retained_than_may_be_and_what_goes_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
     reader, frames = Counted(), [cast(CameraFrame, Frame(value)) for value in range(3)]
     monkeypatch.setattr(solver, "MAX_CACHED_BYTES", 2 * 20)
     once = CachedImages(reader)

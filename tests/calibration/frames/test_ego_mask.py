@@ -62,9 +62,9 @@ def with_body(frames: list[Grey], light: float = 0.0) -> list[Grey]:
 def in_a_circle(frames: list[Grey]) -> tuple[list[Grey], Mask]:
     """Black outside the image circle of a fisheye, and where that is."""
     y, x = np.mgrid[:HEIGHT, :WIDTH]
-    outside = np.hypot(x - WIDTH / 2, y - HEIGHT / 2) > 135
+    context = np.hypot(x - WIDTH / 2, y - HEIGHT / 2) > 135
     rng = np.random.default_rng(98)
-    return [np.where(outside, noisy(np.full(frame.shape, 6.0), rng), frame) for frame in frames], outside
+    return [np.where(context, noisy(np.full(frame.shape, 6.0), rng), frame) for frame in frames], context
 
 
 def shares(mask: Mask, dead: Mask) -> tuple[float, float]:
@@ -75,15 +75,15 @@ def shares(mask: Mask, dead: Mask) -> tuple[float, float]:
 # ------------------------------------------------------------------------------------------- what must be found
 @pytest.mark.parametrize("frames", [5, 10, 25])
 @pytest.mark.parametrize("seed", range(3))
-def test_the_body_is_found(frames: int, seed: int) -> None:
+def test_the_body_is_detected(frames: int, seed: int) -> None:
     mask = lit_pixels(with_body(drive(frames, seed)))
     assert mask is not None
-    found, taken = shares(mask, bonnet())
-    assert found > 0.97
+    result, taken = shares(mask, bonnet())
+    assert result > 0.97
     assert taken < 0.05
 
 
-def test_edges_of_a_body_in_sun_and_shade_are_found() -> None:
+def test_edges_of_a_body_in_sun_and_shade_are_detected() -> None:
     mask = lit_pixels(with_body(drive(12), light=0.3))
     assert mask is not None
     crease = bonnet()
@@ -92,12 +92,12 @@ def test_edges_of_a_body_in_sun_and_shade_are_found() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_ring_around_an_image_circle_is_found_and_the_sky_in_it_is_not(seed: int) -> None:
-    frames, outside = in_a_circle(drive(8, seed))
+def test_the_ring_around_an_image_circle_is_detected_and_the_sky_in_it_is_not(seed: int) -> None:
+    frames, context = in_a_circle(drive(8, seed))
     mask = lit_pixels(frames)
     assert mask is not None
-    found, taken = shares(mask, outside)
-    assert found > 0.97
+    result, taken = shares(mask, context)
+    assert result > 0.97
     assert taken < 0.08
     assert mask[10:30, 150:250].mean() > 0.9
 
@@ -110,17 +110,17 @@ def test_a_drive_with_nothing_in_the_way_has_no_mask(frames: int, seed: int) -> 
     assert mask is None or mask.mean() > 0.99
 
 
-def test_too_few_frames_tell_nothing() -> None:
+def test_too_few_frames_are_uninformative() -> None:
     assert lit_pixels(with_body(drive(MIN_FRAMES - 1))) is None
 
 
-def test_a_standing_vehicle_tells_nothing() -> None:
+def test_a_standing_vehicle_is_uninformative() -> None:
     rng = np.random.default_rng(1)
     scene = world(rng).astype(np.float64)
     assert lit_pixels([noisy(scene, rng) for _ in range(30)]) is None
 
 
-def test_a_standing_vehicle_that_people_pass_tells_nothing() -> None:
+def test_a_standing_vehicle_that_people_pass_is_uninformative() -> None:
     rng = np.random.default_rng(2)
     scene = world(rng).astype(np.float64)
     frames = []
@@ -184,14 +184,14 @@ def test_the_mask_has_the_size_of_the_image(width: int, height: int) -> None:
 
 
 # ------------------------------------------------------------------------------------------------------- in a window
-def test_a_window_without_a_mask_gets_the_one_its_frames_tell(sharp_street: Window, stereo: DepthModel) -> None:
+def test_a_window_without_a_mask_gets_the_one_its_frames_report(sharp_street: Window, stereo: DepthModel) -> None:
     bare = replace(sharp_street, rig=replace(sharp_street.rig, mask=None))
-    sight = prepare_window_data(bare, stereo, GREY, CalibrationConfig(), Silence())
-    assert sight.window.rig.mask is not None
+    window_data = prepare_window_data(bare, stereo, GREY, CalibrationConfig(), Silence())
+    assert window_data.window.rig.mask is not None
     camera = bare.rig.camera
-    assert sight.window.rig.mask.shape == (camera.height, camera.width)
-    assert not sight.window.rig.mask[0, 0]
-    assert sight.window.rig.mask[camera.height // 2, camera.width // 2]
+    assert window_data.window.rig.mask.shape == (camera.height, camera.width)
+    assert not window_data.window.rig.mask[0, 0]
+    assert window_data.window.rig.mask[camera.height // 2, camera.width // 2]
 
 
 def test_frames_of_a_vehicle_that_is_known_to_stand_do_not_count(sharp_street: Window, stereo: DepthModel) -> None:
@@ -242,7 +242,7 @@ def test_a_second_of_slow_traffic_has_no_mask(sample_data: Path) -> None:
 
 
 @pytest.mark.parametrize("frames", [5, 10])
-def test_a_real_body_and_the_rim_of_a_real_fisheye_are_found(
+def test_a_real_body_and_the_rim_of_a_real_fisheye_are_detected(
     sample_data: Path, rng: np.random.Generator, frames: int
 ) -> None:
     """Body and rim of one exposure over the frames of a drive, 10 % brighter and darker: mask_02.png knows the body."""
@@ -252,8 +252,8 @@ def test_a_real_body_and_the_rim_of_a_real_fisheye_are_found(
     assert exposure is not None
     assert known is not None
     y, x = np.mgrid[:1400, :1400]
-    outside = np.hypot(x - 716, y - 700) > 690
-    dead = (known == 0) | outside
+    context = np.hypot(x - 716, y - 700) > 690
+    dead = (known == 0) | context
     painted = []
     for grey in recorded(f"kitti360:{sample_data / 'kitti360'}?camera=image_00")[:frames]:
         scene = cv2.resize(grey[:, :752], (1400, 1400))
@@ -261,6 +261,6 @@ def test_a_real_body_and_the_rim_of_a_real_fisheye_are_found(
         painted.append(np.asarray(np.clip(np.where(dead, lit, scene), 0, 255), np.uint8))
     mask = lit_pixels(painted)
     assert mask is not None
-    found, taken = shares(mask, dead)
-    assert found > 0.99
+    result, taken = shares(mask, dead)
+    assert result > 0.99
     assert taken < 0.03

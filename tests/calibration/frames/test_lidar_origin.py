@@ -34,11 +34,13 @@ def test_a_right_origin_is_not_contradicted(noise_deg: float, walkers: float) ->
 
 @pytest.mark.parametrize("T", [ROOF_POSE, TILTED_ROOF_POSE])
 @pytest.mark.parametrize(("noise_deg", "walkers"), [(0.0, 0.0), (0.1, 0.2)])
-def test_a_wrong_origin_is_told_with_the_right_one(T: NDArray[np.float64], noise_deg: float, walkers: float) -> None:
-    found = apparent_origin(sweep_in_frame(turning_sweep(noise_rad=np.radians(noise_deg), walkers=walkers), T))
-    assert isinstance(found, ApparentOrigin)
-    np.testing.assert_allclose(found.origin_m, T[:3, 3], atol=0.1)
-    assert "look as if measured from (+1." in found.sentence
+def test_a_wrong_origin_is_reported_with_the_right_one(
+    T: NDArray[np.float64], noise_deg: float, walkers: float
+) -> None:
+    result = apparent_origin(sweep_in_frame(turning_sweep(noise_rad=np.radians(noise_deg), walkers=walkers), T))
+    assert isinstance(result, ApparentOrigin)
+    np.testing.assert_allclose(result.origin_m, T[:3, 3], atol=0.1)
+    assert "look as if measured from (+1." in result.sentence
 
 
 def test_a_turned_frame_is_no_wrong_origin() -> None:
@@ -51,7 +53,7 @@ def numbered(sweep: LidarFrame, ring: NDArray[np.integer] | None) -> LidarFrame:
 
 
 @pytest.mark.parametrize("kind", ["none", "constant", "random"])
-def test_where_rings_are_none_nothing_is_said(kind: str) -> None:
+def test_where_rings_are_none_nothing_is_reported(kind: str) -> None:
     sweep = sweep_in_frame(turning_sweep(), ROOF_POSE)
     count = len(sweep.xyz_m)
     ring = {"none": None, "constant": np.zeros(count, int), "random": np.random.default_rng(0).integers(0, 64, count)}
@@ -67,7 +69,7 @@ def test_a_check_gives_up_where_no_cones_explain_the_rings() -> None:
     assert check.inspect(moved) is None
 
 
-def test_the_next_sweep_is_told_too() -> None:
+def test_the_next_sweep_is_reported_too() -> None:
     check = OriginCheck()
     for seed in range(3):
         assert check.inspect(sweep_in_frame(turning_sweep(seed), ROOF_POSE)) is not None

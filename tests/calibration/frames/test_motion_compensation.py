@@ -91,7 +91,7 @@ def test_clockwise_sweep_stamped_ahead(azimuth_deg: float, offset_s: float) -> N
     assert azimuth_offsets_s(point, SweepTiming(0.1, -1))[0] == pytest.approx(offset_s, abs=1e-4)
 
 
-def test_each_reason_for_not_compensating_is_told(street: Window) -> None:
+def test_each_reason_for_not_compensating_is_reported(street: Window) -> None:
     pair = street.pairs[0]
     timeless = replace(pair.lidar, time_offset_s=None)
     cases: list[tuple[FramePair, bool, Compensation]] = [

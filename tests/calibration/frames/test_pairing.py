@@ -86,7 +86,7 @@ def test_motion_is_interpolated_between_its_neighbours() -> None:
     assert pairs[0].motion.stamp_ns == pairs[0].stamp_ns
 
 
-def test_a_velocity_that_one_of_two_samples_does_not_tell_is_not_known_between_them() -> None:
+def test_a_velocity_that_one_of_two_samples_does_not_report_is_not_known_between_them() -> None:
     turning = EgoMotion(START, "ego", None, (0.0, 0.0, 0.2))
     pairs, _ = run([turning, motion(100, 3.0), sweep(25), camera(25)], expects_motion=True)
     assert pairs[0].motion is not None

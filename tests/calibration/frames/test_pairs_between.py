@@ -38,47 +38,47 @@ def pair(second: float, image_bytes: int = 100) -> FramePair:
 
 
 def picked_s(
-    between_pairs: BetweenPairs, seconds: NDArray[np.float64], chosen: set[float], image_bytes: int
+    between_pairs: BetweenPairs, seconds: NDArray[np.float64], selected: set[float], image_bytes: int
 ) -> list[float]:
-    found = []
+    result = []
     for second in seconds.tolist():
-        if second in chosen:
+        if second in selected:
             between_pairs.on_selected(round(second * S))
         elif (thinned := between_pairs.offer(pair(second, image_bytes), FORWARD)) is not None:
-            found.append(thinned.stamp_ns / S)
-    return found
+            result.append(thinned.stamp_ns / S)
+    return result
 
 
-def begun(config: WindowConfig, images: AsTheyAre | Unreadable | None = None) -> BetweenPairs:
+def started(config: WindowConfig, images: AsTheyAre | Unreadable | None = None) -> BetweenPairs:
     made = BetweenPairs(images or AsTheyAre(), 1.0)
     made.begin(config, 0, round(config.slice_s * S))
     return made
 
 
-def test_they_lie_so_far_from_the_chosen_ones_and_from_each_other() -> None:
+def test_they_lie_so_far_from_the_selected_ones_and_from_each_other() -> None:
     config = WindowConfig(pairs=2, min_pairs=2, slice_s=12.0, between_s=2.0)
-    found = picked_s(begun(config), np.arange(0.0, 12.0, 0.5), {1.0, 6.5}, 100)
-    assert found == [3.0, 5.0, 8.5, 10.5], "before the first pair of a window there is nothing to lie between"
+    result = picked_s(started(config), np.arange(0.0, 12.0, 0.5), {1.0, 6.5}, 100)
+    assert result == [3.0, 5.0, 8.5, 10.5], "before the first pair of a window there is nothing to lie between"
 
 
 @pytest.mark.parametrize(("slice_s", "between_mib"), [(20.0, 48), (180.0, 0)])
-def test_there_are_none_where_pairs_are_near_to_each_other_or_where_none_are_wanted(
+def test_there_are_none_where_pairs_are_near_to_each_other_or_where_none_are_requested(
     slice_s: float, between_mib: int
 ) -> None:
     config = WindowConfig(pairs=11, min_pairs=2, slice_s=slice_s, between_s=1.0, between_mib=between_mib)
-    assert picked_s(begun(config), np.arange(0.0, slice_s, 0.5), {0.0}, 100) == []
+    assert picked_s(started(config), np.arange(0.0, slice_s, 0.5), {0.0}, 100) == []
 
 
 def test_large_images_are_fewer_and_evenly_spread() -> None:
     config = WindowConfig(pairs=5, min_pairs=2, slice_s=100.0, between_s=1.0, between_mib=1)
-    found = picked_s(begun(config), np.arange(0.0, 100.0, 0.5), {0.0}, 2**20 // 10 - 100)
-    assert len(found) == 10
-    assert max(np.diff([*found, 100.0])) <= 11.0
+    result = picked_s(started(config), np.arange(0.0, 100.0, 0.5), {0.0}, 2**20 // 10 - 100)
+    assert len(result) == 10
+    assert max(np.diff([*result, 100.0])) <= 11.0
 
 
 def test_an_image_that_cannot_be_read_is_passed_over() -> None:
     config = WindowConfig(pairs=2, min_pairs=2, slice_s=12.0)
-    assert picked_s(begun(config, Unreadable()), np.arange(0.0, 12.0, 0.5), {0.0}, 100) == []
+    assert picked_s(started(config, Unreadable()), np.arange(0.0, 12.0, 0.5), {0.0}, 100) == []
 
 
 def street(rings: int, columns: int, *, numbered: bool) -> LidarFrame:
@@ -112,13 +112,13 @@ def test_range_edges_of_a_thinned_sweep_are_edges_of_the_whole(numbered: bool) -
     index = np.array([places[point.tobytes()] for point in thinned.xyz_m])
     np.testing.assert_array_equal(thinned.time_offset_s, whole.time_offset_s[index])
     of_whole, of_thinned = (range_edges(sweep.xyz_m, sweep.ring) for sweep in (whole, thinned))
-    found = set(index[of_thinned.index].tolist())
-    assert found <= set(of_whole.index.tolist())
+    result = set(index[of_thinned.index].tolist())
+    assert result <= set(of_whole.index.tolist())
     # At the border of what is kept, a neighbour may be missing.
     angle = np.arccos(whole.xyz_m[:, 0] / np.linalg.norm(whole.xyz_m, axis=1))
-    kept = set(index[angle[index] < np.radians(45.0) + window.BEYOND_RAD - NEIGHBOUR_RAD].tolist())
-    seen = kept & set(of_whole.index.tolist())
-    assert seen <= found, "none of the lines that are kept is torn"
+    retained = set(index[angle[index] < np.radians(45.0) + window.BEYOND_RAD - NEIGHBOUR_RAD].tolist())
+    seen = retained & set(of_whole.index.tolist())
+    assert seen <= result, "none of the lines that are kept is torn"
     assert len(seen) > 100
 
 

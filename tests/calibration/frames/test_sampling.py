@@ -64,11 +64,11 @@ def test_a_vehicle_drives_where_most_pairs_know_that_it_does(street: Window) -> 
     assert not driving()
 
 
-def test_pairs_hours_apart_are_not_one_check(street: Window) -> None:
+def test_pairs_hours_from_each_other_are_not_one_check(street: Window) -> None:
     first = [100.0 + 0.5 * i for i in range(9)]
     assert checks(street, [*first, 8 * 3600.0]) == []
-    apart = checks(street, [100.0, 131.0, 162.0, 193.0, 224.0, 255.0])
-    assert apart == [], "no four of them lie within six periods"
+    separation = checks(street, [100.0, 131.0, 162.0, 193.0, 224.0, 255.0])
+    assert separation == [], "no four of them lie within six periods"
     assert checks(street, [100.0, 107.0, 114.0, 121.0, 128.0]) == [[100.0, 107.0, 114.0, 121.0]]
 
 

@@ -30,11 +30,11 @@ BENDS = 14
 
 def turn_rates_radps(drive: SimulatedDrive) -> NDArray[np.float64]:
     """(N,) true turn rate of the vehicle at each camera frame."""
-    apart_ns = 10_000_000
+    separation_ns = 10_000_000
 
     def rate(stamp_ns: int) -> float:
-        before, after = drive.true_pose(stamp_ns - apart_ns), drive.true_pose(stamp_ns + apart_ns)
-        return float(se3.rotation_log(before[:3, :3].T @ after[:3, :3])[2] / (2e-9 * apart_ns))
+        before, after = drive.true_pose(stamp_ns - separation_ns), drive.true_pose(stamp_ns + separation_ns)
+        return float(se3.rotation_log(before[:3, :3].T @ after[:3, :3])[2] / (2e-9 * separation_ns))
 
     return np.array([rate(stamp_ns) for stamp_ns in drive.camera_stamps_ns])
 
@@ -77,10 +77,10 @@ def estimate(window: Window, config: CalibrationConfig = CONFIG) -> TimeOffset:
 
 @pytest.mark.parametrize("offset_s", [0.0, 0.04, -0.03])
 def test_an_offset_is_recovered_in_bends(bends: Window, offset_s: float) -> None:
-    found = estimate(late(bends, offset_s))
-    assert found.observable, found.reason
-    assert abs(found.offset_s - offset_s) <= 3.0 * found.sigma_s
-    assert found.turn_spread_radps > radians(CONFIG.time_offset.min_turn_spread_deg_per_s)
+    result = estimate(late(bends, offset_s))
+    assert result.observable, result.reason
+    assert abs(result.offset_s - offset_s) <= 3.0 * result.sigma_s
+    assert result.turn_spread_radps > radians(CONFIG.time_offset.min_turn_spread_deg_per_s)
 
 
 def test_shifting_the_stamps_shifts_the_offset(bends: Window) -> None:
@@ -90,38 +90,38 @@ def test_shifting_the_stamps_shifts_the_offset(bends: Window) -> None:
 
 
 def test_a_straight_drive_does_not_show_it(straight: Window) -> None:
-    found = estimate(late(straight, 0.04))
-    assert not found.observable
-    assert "straight" in found.reason
+    result = estimate(late(straight, 0.04))
+    assert not result.observable
+    assert "straight" in result.reason
 
 
 def test_an_offset_beyond_reach_is_not_believed(bends: Window) -> None:
     near = CONFIG.model_copy(update={"time_offset": CONFIG.time_offset.model_copy(update={"reach_s": 0.04})})
-    found = estimate(late(bends, 0.09), near)
-    assert not found.observable
-    assert "bound" in found.reason
+    result = estimate(late(bends, 0.09), near)
+    assert not result.observable
+    assert "bound" in result.reason
 
 
 def test_what_the_position_of_the_mount_is_not_known_to_goes_into_sigma(bends: Window) -> None:
     vague = CONFIG.time_offset.model_copy(update={"translation_sigma_m": 0.5})
-    found = estimate(bends, CONFIG.model_copy(update={"time_offset": vague}))
-    assert not found.observable
-    assert found.sigma_s > 3.0 * estimate(bends).sigma_s
-    assert "known to" in found.reason
+    result = estimate(bends, CONFIG.model_copy(update={"time_offset": vague}))
+    assert not result.observable
+    assert result.sigma_s > 3.0 * estimate(bends).sigma_s
+    assert "known to" in result.reason
 
 
 def test_without_ego_motion_there_is_nothing_to_see(bends: Window) -> None:
     standing = replace(bends, pairs=tuple(replace(pair, motion=None) for pair in bends.pairs))
-    found = estimate(standing)
-    assert not found.observable
-    assert isnan(found.offset_s)
-    assert "ego-motion" in found.reason
+    result = estimate(standing)
+    assert not result.observable
+    assert isnan(result.offset_s)
+    assert "ego-motion" in result.reason
 
 
 def test_without_motion_compensation_there_is_nothing_to_see(bends: Window) -> None:
-    found = estimate(bends, CONFIG.model_copy(update={"motion_compensation": False}))
-    assert not found.observable
-    assert "motion compensation" in found.reason
+    result = estimate(bends, CONFIG.model_copy(update={"motion_compensation": False}))
+    assert not result.observable
+    assert "motion compensation" in result.reason
 
 
 def test_same_input_same_bits(bends: Window) -> None:
@@ -132,10 +132,10 @@ def test_same_input_same_bits(bends: Window) -> None:
 @pytest.mark.parametrize("offset_s", [0.0, 0.04])
 def test_an_offset_is_recovered_on_a_recording(sample_data: Path, camera: str, offset_s: float) -> None:
     window = window_of(open_source(f"kitti360:{sample_data / 'kitti360'}?camera={camera}"))
-    found = estimate(late(window, offset_s))
-    assert found.observable, found.reason
-    assert abs(found.offset_s - offset_s) <= 3.0 * found.sigma_s
-    assert abs(found.offset_s - offset_s) < 0.005
+    result = estimate(late(window, offset_s))
+    assert result.observable, result.reason
+    assert abs(result.offset_s - offset_s) <= 3.0 * result.sigma_s
+    assert abs(result.offset_s - offset_s) < 0.005
 
 
 def test_the_straight_part_of_a_recording_does_not_show_it(sample_data: Path) -> None:
@@ -143,7 +143,7 @@ def test_the_straight_part_of_a_recording_does_not_show_it(sample_data: Path) ->
     straight = tuple(
         pair for pair in window.pairs if pair.motion is not None and abs(pair.motion.angular_radps[2]) < radians(2.0)
     )
-    found = estimate(replace(window, pairs=straight))
+    result = estimate(replace(window, pairs=straight))
     assert len(straight) == 5
-    assert not found.observable
-    assert "straight" in found.reason
+    assert not result.observable
+    assert "straight" in result.reason

@@ -58,7 +58,7 @@ def selected_s(events: list[WindowEvent]) -> list[float]:
     return [(e.pair.stamp_ns - 1_000 * S) / S for e in events if isinstance(e, PairSelected)]
 
 
-def test_one_pair_of_each_bin_and_the_rest_is_not_looked_at(street: Window) -> None:
+def test_one_pair_of_each_bin_and_the_rest_is_not_checked(street: Window) -> None:
     inspector = Inspector()
     events = drive(WindowCutter(CONFIG, street.rig, inspector, AsTheyAre()), street, [i * 0.5 for i in range(100)])
     assert selected_s(events) == [0.0, 10.0, 20.0, 30.0, 40.0]
@@ -95,7 +95,7 @@ def test_silence_ends_a_slice_when_its_time_has_passed(street: Window) -> None:
     assert cutter.advance(2_000 * S) == []
 
 
-def test_nothing_selected_is_nothing_ended(street: Window) -> None:
+def test_nothing_selected_is_nothing_closed(street: Window) -> None:
     assert WindowCutter(CONFIG, street.rig, Inspector(), AsTheyAre()).finish() == []
 
 
@@ -179,38 +179,38 @@ def test_sensor_time_that_steps_back_ends_the_slice(street: Window) -> None:
     assert selected_s(events)[-1] == -500.0
 
 
-KEPT = CarriedOverPairs("street-960000000000", 990 * S, 998 * S, 2)
+RETAINED = CarriedOverPairs("street-960000000000", 990 * S, 998 * S, 2)
 
 
-def test_kept_pairs_count_for_the_window_and_end_it_when_it_is_as_large_as_any(street: Window) -> None:
+def test_retained_pairs_count_for_the_window_and_end_it_when_it_is_as_large_as_any(street: Window) -> None:
     cutter = WindowCutter(CONFIG, street.rig, Inspector(), AsTheyAre())
     events = drive(cutter, street, [0.0, 2.0])
     assert cutter.selected == 1
-    cutter.carry_over(KEPT)
+    cutter.carry_over(RETAINED)
     assert cutter.selected == 3
     events += drive(cutter, street, [10.0 + 2.0 * i for i in range(10)])
-    (ended,) = (e for e in events if isinstance(e, SliceClosed))
-    assert (ended.pairs, ended.complete, ended.carried_over) == (CONFIG.pairs, True, KEPT)
+    (finished,) = (e for e in events if isinstance(e, SliceClosed))
+    assert (finished.pairs, finished.complete, finished.carried_over) == (CONFIG.pairs, True, RETAINED)
     assert selected_s(events)[:3] == [0.0, 10.0, 20.0]
     assert cutter.selected == 1, "the next one begins without them"
 
 
-def test_kept_pairs_wait_for_a_slice_that_is_a_window(street: Window) -> None:
+def test_retained_pairs_wait_for_a_slice_that_is_a_window(street: Window) -> None:
     cutter = WindowCutter(CONFIG, street.rig, Inspector(), AsTheyAre())
     drive(cutter, street, [0.0])
-    cutter.carry_over(replace(KEPT, pairs=1))
+    cutter.carry_over(replace(RETAINED, pairs=1))
     ((short,), later) = cutter.finish(), drive(cutter, street, [2.0, 12.0])
     assert isinstance(short, SliceClosed)
     assert (short.complete, short.carried_over) == (False, None)
     assert len(selected_s(later)) == 2
-    (ended,) = cutter.finish()
-    assert (ended.pairs, ended.complete, ended.carried_over) == (3, True, replace(KEPT, pairs=1))
+    (finished,) = cutter.finish()
+    assert (finished.pairs, finished.complete, finished.carried_over) == (3, True, replace(RETAINED, pairs=1))
 
 
 @pytest.mark.parametrize("begins_s", [CONFIG.slice_s + 0.5, -10.0])
-def test_kept_pairs_of_another_time_are_forgotten_aloud(street: Window, begins_s: float) -> None:
+def test_retained_pairs_of_another_time_are_dropped_with_a_log_entry(street: Window, begins_s: float) -> None:
     cutter = WindowCutter(CONFIG, street.rig, Inspector(), AsTheyAre())
-    cutter.carry_over(KEPT)
+    cutter.carry_over(RETAINED)
     events = drive(cutter, street, [begins_s])
-    assert [e for e in events if isinstance(e, CarriedOverDropped)] == [CarriedOverDropped(KEPT)]
+    assert [e for e in events if isinstance(e, CarriedOverDropped)] == [CarriedOverDropped(RETAINED)]
     assert cutter.selected == 1

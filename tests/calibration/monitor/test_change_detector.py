@@ -159,7 +159,7 @@ class TestEvidence:
     @pytest.mark.fault(
         "every check on a highway is off in the same way", "the mount is accused by no more than such checks can tell"
     )
-    def test_what_a_scene_cannot_tell_accuses_nobody(self, record_property: Callable[[str, object], None]) -> None:
+    def test_what_a_scene_cannot_decide_accuses_nobody(self, record_property: Callable[[str, object], None]) -> None:
         off_alike = [turned(0.4, 0.0, 0.0)] * 60
         states = {
             scene: after(*(fresh(n, offset=offset, dispersion=scene) for n, offset in enumerate(off_alike)))
@@ -209,7 +209,7 @@ class TestEvidence:
         faint = after_observation(suspect, fresh(2, flagged=False, weak=True), LEVELS)
         assert faint.outcome is MonitorOutcome.SUSPECT
 
-    def test_a_check_that_does_not_tell_translations_tells_rotations(self) -> None:
+    def test_a_check_that_does_not_determine_translations_determines_rotations(self) -> None:
         half = np.array([*OFFSET[:3], np.nan, np.nan, np.nan])
         assert after(*(fresh(n, offset=half) for n in range(3))).outcome is MonitorOutcome.CONFIRMED
 
@@ -249,8 +249,8 @@ class TestStandstill:
     def test_another_offset_contradicts_though_neither_check_is_flagged(self) -> None:
         near = turned(0.5, 0.0, 0.0)
         state = after(fresh(0, flagged=False), self.standing(1, flagged=False))
-        apart = replace(self.standing(2, flagged=False), offset=near, sigma=np.full(6, 0.01))
-        assert after_observation(state, apart, LEVELS).evidence > state.evidence
+        separation = replace(self.standing(2, flagged=False), offset=near, sigma=np.full(6, 0.01))
+        assert after_observation(state, separation, LEVELS).evidence > state.evidence
 
 
 class TestAcquittal:
@@ -270,10 +270,10 @@ class TestAcquittal:
         states = [after(fresh(0, flagged=False), *open_still[:count]) for count in (1, 2, 3)]
         assert [is_acquitted(one, 0, config) for one in states] == [True, True, False]
 
-    def test_a_check_beside_where_the_mount_has_been_acquits_nothing_though_it_is_within_the_limits(self) -> None:
+    def test_a_check_next_to_where_the_mount_has_been_acquits_nothing_though_it_is_within_the_limits(self) -> None:
         """Ten centimetres are within what estimators are off on other rigs, but not within what this one was off."""
         rig, noise, place = 0.03, 0.012, 0.01
-        aside = np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
+        displaced = np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
 
         def at(number: int, offset: NDArray[np.float64]) -> Observation:
             sigma = np.full(6, float(np.hypot(rig, noise)))
@@ -282,31 +282,36 @@ class TestAcquittal:
 
         learned = after(*(at(n, RIGHT) for n in range(12)))
         assert learned.unacquitted == 0
-        assert [after_observation(learned, at(12, offset), LEVELS).unacquitted for offset in (RIGHT, aside)] == [0, 1]
-        kept = after_window(learned, 10**9, LEVELS, solved_translation=False, agrees=False)
-        assert after_observation(kept, at(12, aside), LEVELS).unacquitted == 1, "a window without translation is blind"
-        told = after_window(learned, 10**9, LEVELS, solved_translation=True, agrees=False)
-        assert after_observation(told, at(12, aside), LEVELS).unacquitted == 0, "a window found it there"
+        assert [after_observation(learned, at(12, offset), LEVELS).unacquitted for offset in (RIGHT, displaced)] == [
+            0,
+            1,
+        ]
+        retained = after_window(learned, 10**9, LEVELS, solved_translation=False, agrees=False)
+        assert after_observation(retained, at(12, displaced), LEVELS).unacquitted == 1, (
+            "a window without translation is blind"
+        )
+        reported = after_window(learned, 10**9, LEVELS, solved_translation=True, agrees=False)
+        assert after_observation(reported, at(12, displaced), LEVELS).unacquitted == 0, "a window found it there"
 
-    def test_a_place_where_the_mount_lies_beside_where_it_has_been_is_not_acquitted_by_standing_there(self) -> None:
+    def test_a_place_where_the_mount_lies_next_to_where_it_has_been_is_not_acquitted_by_standing_there(self) -> None:
         rig, noise = 0.03, 0.012
-        aside = np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
+        displaced = np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
 
         def at(number: int, offset: NDArray[np.float64], *, standing: bool = False) -> Observation:
             one = fresh(number, flagged=False, offset=offset, standing=standing)
             sigma = np.full(6, float(np.hypot(rig, noise)))
             return replace(one, sigma=sigma, noise=np.full(6, noise), place=np.full(6, 0.01))
 
-        parked = after(*(at(n, RIGHT) for n in range(12)), *(at(12 + n, aside, standing=True) for n in range(4)))
+        parked = after(*(at(n, RIGHT) for n in range(12)), *(at(12 + n, displaced, standing=True) for n in range(4)))
         assert not is_acquitted(parked, 0, MonitorConfig())
-        assert parked.evidence == after(*(at(n, RIGHT) for n in range(12)), at(12, aside, standing=True)).evidence
+        assert parked.evidence == after(*(at(n, RIGHT) for n in range(12)), at(12, displaced, standing=True)).evidence
 
     def test_a_window_without_translation_does_not_clear_a_translation(self) -> None:
         shifted = np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
         state = after(*(fresh(n, flagged=False) for n in range(5)), *(fresh(5 + n, offset=shifted) for n in range(4)))
         assert state.outcome is MonitorOutcome.CONFIRMED
-        kept = after_window(state, 10**9, LEVELS, solved_translation=False, agrees=True)
-        assert kept.outcome is MonitorOutcome.CONFIRMED
+        retained = after_window(state, 10**9, LEVELS, solved_translation=False, agrees=True)
+        assert retained.outcome is MonitorOutcome.CONFIRMED
         assert (
             after_window(state, 10**9, LEVELS, solved_translation=True, agrees=True).outcome is MonitorOutcome.UNKNOWN
         )
@@ -332,11 +337,11 @@ class TestMountScatter:
         assert max(self.evidence(step)) < LOOSE_AT / 2
 
     def evidence(self, checks: Sequence[Observation]) -> list[float]:
-        state, found = MonitorState(), []
+        state, result = MonitorState(), []
         for check in checks:
             state = after_observation(state, check, LEVELS)
-            found.append(state.scatter.evidence)
-        return found
+            result.append(state.scatter.evidence)
+        return result
 
     def test_faint_checks_say_nothing_of_scatter(self) -> None:
         faint = [replace(check, weak=True) for check in self.swinging(0.4, 40)]

@@ -71,22 +71,22 @@ def evidence(sharp_street: Window, stereo: DepthModel) -> CheckInput:
 
 
 class TestSupport:
-    def test_edges_insist_beside_a_wrong_pose_and_not_at_the_right_one(
+    def test_edges_insist_next_to_a_wrong_pose_and_not_at_the_right_one(
         self, evidence: CheckInput, sharp_street: Window
     ) -> None:
         right, xi = sharp_street.rig.T_camera_lidar_nominal, np.array([0, np.radians(1.0), 0, 0, 0, 0])
         assert not check_at(evidence, right).of_rotation.insists
-        beside = check_at(evidence, se3.perturb(right, xi))
-        assert beside.of_rotation.insists
-        assert beside.of_pose.insists
+        neighbour = check_at(evidence, se3.perturb(right, xi))
+        assert neighbour.of_rotation.insists
+        assert neighbour.of_pose.insists
 
     def test_nothing_is_gained_where_the_bias_puts_the_optimum(
         self, evidence: CheckInput, sharp_street: Window
     ) -> None:
         right, xi = sharp_street.rig.T_camera_lidar_nominal, np.array([0, np.radians(1.0), 0, 0, 0, 0])
-        told = check_at(evidence, se3.perturb(right, xi), Expected(-xi, -xi))
-        assert not told.of_rotation.insists
-        assert not told.of_pose.insists
+        reported = check_at(evidence, se3.perturb(right, xi), Expected(-xi, -xi))
+        assert not reported.of_rotation.insists
+        assert not reported.of_pose.insists
 
     @pytest.mark.fault("one thing in the image pulls the optimum aside", "the look does not accuse the mount")
     def test_what_all_cells_gain_is_certain_and_what_a_few_gain_is_not(
@@ -97,14 +97,14 @@ class TestSupport:
         one_thing = np.zeros((6, 16))
         one_thing[:, 3] = 16 * 0.3
         assert everywhere.insists
-        aside = support(there, there - one_thing)
-        assert aside.retained == pytest.approx(everywhere.retained, abs=0.02)
-        assert not aside.gained
-        record_property("figure", f"gained by {aside.certainty:.1f} σ; by all alike {everywhere.certainty:.0f} σ")
+        offset = support(there, there - one_thing)
+        assert offset.retained == pytest.approx(everywhere.retained, abs=0.02)
+        assert not offset.gained
+        record_property("figure", f"gained by {offset.certainty:.1f} σ; by all alike {everywhere.certainty:.0f} σ")
 
     def test_an_optimum_without_edges_gained_nothing(self) -> None:
-        told = support(np.zeros((6, 16)), np.zeros((6, 16)))
-        assert (told.retained, told.certainty, told.insists) == (1.0, 0.0, False)
+        reported = support(np.zeros((6, 16)), np.zeros((6, 16)))
+        assert (reported.retained, reported.certainty, reported.insists) == (1.0, 0.0, False)
 
 
 NOTHING = Support(retained=1.0, certainty=0.0)
@@ -134,7 +134,7 @@ class TestOpinion:
     LIMITS = MonitorLimits(12.0, 12.0, 4.0, insisted_share=0.25)
     ACCURACY = Accuracy(np.zeros(6), np.full(6, 0.001), np.zeros(6))
 
-    def said(self, seen: Check, off: float, limits: MonitorLimits = LIMITS) -> Opinion:
+    def message(self, seen: Check, off: float, limits: MonitorLimits = LIMITS) -> Opinion:
         sigma = self.ACCURACY.sigma(1)[0]
         seen = replace(seen, offset_rotation=np.array([off * sigma * np.sqrt(3.0), 0, 0, 0, 0, 0]))
         over, _ = over_limits(seen, self.ACCURACY, self.ACCURACY, limits)
@@ -154,24 +154,24 @@ class TestOpinion:
         self, support_there: Support, opinions: tuple[Opinion, ...]
     ) -> None:
         seen = replace(A_CHECK, of_rotation=support_there)
-        assert tuple(self.said(seen, off) for off in (0.9, 1.1, 2.1)) == opinions
+        assert tuple(self.message(seen, off) for off in (0.9, 1.1, 2.1)) == opinions
 
     def test_the_share_is_of_rigs_whose_bias_is_known(self) -> None:
         limits = MonitorLimits(12.0, 12.0, 4.0)
         seen = replace(A_CHECK, of_rotation=INSISTS)
-        assert [self.said(seen, off, limits) for off in (1.1, 2.1)] == [Opinion.CLEAR, Opinion.FLAGGED]
+        assert [self.message(seen, off, limits) for off in (1.1, 2.1)] == [Opinion.CLEAR, Opinion.FLAGGED]
 
     @pytest.mark.fault("a scene in which everything runs to one point, as on a highway", "one look accuses nobody")
     def test_a_scene_where_optima_scatter_accuses_nobody(self) -> None:
         seen = replace(A_CHECK, of_rotation=INSISTS, contrast=TELLING_CONTRAST - 0.1)
-        assert [self.said(seen, off) for off in (0.9, 1.1, 2.1)] == [Opinion.CLEAR, *[Opinion.UNDECIDED] * 2]
+        assert [self.message(seen, off) for off in (0.9, 1.1, 2.1)] == [Opinion.CLEAR, *[Opinion.UNDECIDED] * 2]
 
-    def test_but_where_most_edges_are_lost_any_scene_tells(self) -> None:
+    def test_but_where_most_edges_are_lost_any_scene_reports(self) -> None:
         seen = replace(A_CHECK, of_rotation=replace(INSISTS, retained=0.4), contrast=TELLING_CONTRAST - 0.1)
-        assert self.said(seen, 2.1) is Opinion.FLAGGED
+        assert self.message(seen, 2.1) is Opinion.FLAGGED
 
     def test_what_one_optimum_insists_on_the_other_does_not_say(self) -> None:
-        assert self.said(replace(A_CHECK, of_pose=INSISTS), 2.1) is Opinion.UNDECIDED
+        assert self.message(replace(A_CHECK, of_pose=INSISTS), 2.1) is Opinion.UNDECIDED
 
 
 @pytest.mark.parametrize(
@@ -183,13 +183,13 @@ def test_an_optimum_that_stands_out_by_chance_only_is_weak(
 ) -> None:
     pairs = len(evidence.pairs)
     seen = replace(A_CHECK, pairs=pairs, contrast=contrast, edges_at_best=edges * float(np.sqrt(pairs)))
-    told = judge_check(evidence, seen, sharp_street.T_camera_lidar_start, None)
-    assert told.weak is weak
-    assert not told.flagged
+    reported = judge_check(evidence, seen, sharp_street.T_camera_lidar_start, None)
+    assert reported.weak is weak
+    assert not reported.flagged
 
 
 @pytest.mark.parametrize(
-    ("in_view", "looks", "weak"),
+    ("in_view", "observations", "weak"),
     [
         (MIN_EDGES_IN_VIEW + 1, 6.0, False),
         (MIN_EDGES_IN_VIEW - 1, 6.0, True),
@@ -198,13 +198,13 @@ def test_an_optimum_that_stands_out_by_chance_only_is_weak(
     ],
 )
 def test_few_edges_and_frames_that_say_the_same_decide_nothing_however_well_they_fit(
-    evidence: CheckInput, sharp_street: Window, in_view: float, looks: float, weak: bool
+    evidence: CheckInput, sharp_street: Window, in_view: float, observations: float, weak: bool
 ) -> None:
     pairs = len(evidence.pairs)
     moved = np.array([0.0, np.radians(1.0), 0, 0, 0, 0])
     seen = replace(
-        A_CHECK, pairs=pairs, edges_in_view=int(in_view * pairs), independent_samples=looks, edges_at_best=100.0,
+        A_CHECK, pairs=pairs, edges_in_view=int(in_view * pairs), independent_samples=observations, edges_at_best=100.0,
         offset_rotation=moved, of_rotation=INSISTS,
     )  # fmt: skip
-    told = judge_check(evidence, seen, sharp_street.T_camera_lidar_start, None)
-    assert (told.flagged, told.weak) == (True, weak)
+    reported = judge_check(evidence, seen, sharp_street.T_camera_lidar_start, None)
+    assert (reported.flagged, reported.weak) == (True, weak)

@@ -25,10 +25,10 @@ class Counted:
     """Counts what is inferred."""
 
     def __init__(self, model: DepthModel) -> None:
-        self.identity, self.asked, self._model = model.identity, 0, model
+        self.identity, self.requested, self._model = model.identity, 0, model
 
     def infer(self, frame: CameraFrame) -> DepthMap:
-        self.asked += 1
+        self.requested += 1
         return self._model.infer(frame)
 
 
@@ -41,23 +41,23 @@ def moved(window: Window, xi: list[float]) -> Window:
     return replace(window, T_camera_lidar_start=se3.perturb(window.T_camera_lidar_start, np.array(xi)))
 
 
-def sight(window: Window, depth: DepthModel) -> WindowData:
+def window_data(window: Window, depth: DepthModel) -> WindowData:
     return prepare_window_data(window, depth, IMAGES, CONFIG, Silence())
 
 
 class TestDepth:
-    def test_is_not_asked_where_the_edges_are_clear_and_at_home(self, six: Window, stereo: DepthModel) -> None:
+    def test_is_not_requested_where_the_edges_are_clear_and_at_home(self, six: Window, stereo: DepthModel) -> None:
         depth = Counted(stereo)
-        told = observe(six, depth, IMAGES, CONFIG, None)
-        assert (told.flagged, told.weak, told.causes, depth.asked) == (False, False, (), 0)
-        assert "mi" not in {metric.name for metric in told.metrics}
+        reported = observe(six, depth, IMAGES, CONFIG, None)
+        assert (reported.flagged, reported.weak, reported.causes, depth.requested) == (False, False, (), 0)
+        assert "mi" not in {metric.name for metric in reported.metrics}
 
-    def test_is_asked_where_they_accuse(self, six: Window, stereo: DepthModel) -> None:
+    def test_is_requested_where_they_accuse(self, six: Window, stereo: DepthModel) -> None:
         depth = Counted(stereo)
-        told = observe(moved(six, [0.0, np.radians(1.5), 0, 0, 0, 0]), depth, IMAGES, CONFIG, None)
-        assert (told.flagged, depth.asked) == (True, 6)
-        assert {"mi", "f1", "f2", "agreement_deg"} < {metric.name for metric in told.metrics}
-        assert np.isfinite(told.first_derivative).all()
+        reported = observe(moved(six, [0.0, np.radians(1.5), 0, 0, 0, 0]), depth, IMAGES, CONFIG, None)
+        assert (reported.flagged, depth.requested) == (True, 6)
+        assert {"mi", "f1", "f2", "agreement_deg"} < {metric.name for metric in reported.metrics}
+        assert np.isfinite(reported.first_derivative).all()
 
     def test_changes_no_verdict(self, six: Window, stereo: DepthModel) -> None:
         short, full = observe(six, stereo, IMAGES, CONFIG, None), diagnose(six, stereo, IMAGES, CONFIG, None)
@@ -66,11 +66,11 @@ class TestDepth:
 
 
 @pytest.mark.parametrize("xi", [[0, 0, 0, 0, 0, 0], [0.02, -0.02, 0.01, 0, 0, 0], [0, 0.052, 0, 0, 0, 0]])
-def test_the_optimum_over_rotations_is_found_from_degrees_away(
+def test_the_optimum_over_rotations_is_detected_from_degrees_away(
     six: Window, stereo: DepthModel, xi: list[float]
 ) -> None:
     start = moved(six, xi)
-    seen = check_at(gather(sight(start, stereo)), start.T_camera_lidar_start)
+    seen = check_at(gather(window_data(start, stereo)), start.T_camera_lidar_start)
     off = se3.difference(seen.T_rotation, six.rig.T_camera_lidar_nominal)
     assert np.degrees(np.abs(off[:3])).max() < 0.3
 
@@ -85,8 +85,8 @@ def test_sensors_that_were_prepared_once_serve_every_pair(six: Window, stereo: D
     greys = (IMAGES.grey(pair.camera) for pair in six.pairs)
     images = prepare_images(greys, len(six.pairs), rig.camera, rig.mask, upright, part, part)
     for window in (six, other):
-        shared = check_at(join(sight(window, stereo), sweeps, images, REACH_RAD), window.T_camera_lidar_start)
-        alone = check_at(gather(sight(window, stereo)), window.T_camera_lidar_start)
+        shared = check_at(join(window_data(window, stereo), sweeps, images, REACH_RAD), window.T_camera_lidar_start)
+        alone = check_at(gather(window_data(window, stereo)), window.T_camera_lidar_start)
         # The strip is somewhat larger, and so are the figures that it is counted in.
         assert np.degrees(se3.rotation_angle_rad(shared.T_rotation @ se3.inverse(alone.T_rotation))) < 0.05
         assert shared.edges_at_best == pytest.approx(alone.edges_at_best, rel=0.05)
@@ -94,7 +94,7 @@ def test_sensors_that_were_prepared_once_serve_every_pair(six: Window, stereo: D
 
 def test_only_a_strip_of_the_images_is_prepared(six: Window, stereo: DepthModel) -> None:
     camera = six.rig.camera
-    evidence = gather(sight(six, stereo))
+    evidence = gather(window_data(six, stereo))
     _, height, width = evidence.edges.sharp.frames.maps.shape
     assert height * width < 0.5 * camera.height * camera.width
     assert evidence.edges.of([1, 3]).sharp.frames.maps.shape == (2, height, width)

@@ -28,12 +28,12 @@ def at(degrees: float) -> Three:
 
 def evidence_after(seen_deg: float, right_deg: float, age: float) -> float:
     """Of an old test that took the mount to have moved to where the next check sees it, too."""
-    told = CheckMeasurement(at(seen_deg), NOISE, PLACE, PLACE, RIG, at(seen_deg), weak=False)
+    reported = CheckMeasurement(at(seen_deg), NOISE, PLACE, PLACE, RIG, at(seen_deg), weak=False)
     rig = OffsetPosterior(at(0.0), KNOWN)
     test = Hypothesis(
         1, age, EVIDENCE, OffsetPosterior(at(seen_deg), KNOWN), OffsetPosterior(at(right_deg), KNOWN), rig
     )
-    leading = after_check(Hypotheses(rig, (test,), told.before), told, ROTATIONS, 1.0, MOST).leading
+    leading = after_check(Hypotheses(rig, (test,), reported.before), reported, ROTATIONS, 1.0, MOST).leading
     assert leading is not None
     return leading.evidence
 

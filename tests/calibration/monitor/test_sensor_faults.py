@@ -93,11 +93,11 @@ def ground_alone(window: Window, rng: np.random.Generator) -> Window:
     """Nothing stands on the plain; the sensor is 1.7 m above it."""
     del rng
 
-    def chosen(sweep: LidarFrame, index: int) -> NDArray[np.intp]:
+    def selected(sweep: LidarFrame, index: int) -> NDArray[np.intp]:
         del index
         return np.flatnonzero(sweep.xyz_m[:, 2] < -1.4)
 
-    return degradations.with_points(window, chosen)
+    return degradations.with_points(window, selected)
 
 
 def unchanged(window: Window, rng: np.random.Generator) -> Window:

@@ -59,7 +59,7 @@ def test_without_an_alarm_nothing_changes(street: Window) -> None:
     assert [second for second, _ in Drive(street).until(1000, 1201)] == [1100.0, 1200.0]
 
 
-def test_a_slice_that_mixes_two_mounts_is_ended_and_a_dense_one_follows(street: Window) -> None:
+def test_a_slice_that_mixes_two_mounts_is_closed_and_a_dense_one_follows(street: Window) -> None:
     drive = Drive(street)
     assert drive.until(1000, 1070) == []
     drive.urgency.alarm(since_ns=1055 * S)
@@ -68,14 +68,14 @@ def test_a_slice_that_mixes_two_mounts_is_ended_and_a_dense_one_follows(street: 
     assert [second for second in drive.selected if 1070 <= second < 1090] == [1070.0 + 2 * i for i in range(10)]
 
 
-def test_a_clean_slice_with_enough_pairs_is_ended_at_once_and_no_dense_one_follows(street: Window) -> None:
+def test_a_clean_slice_with_enough_pairs_is_closed_at_once_and_no_dense_one_follows(street: Window) -> None:
     drive = Drive(street)
     drive.until(1000, 1045)
     drive.urgency.alarm(since_ns=1000 * S)
     assert [(second, end.pairs) for second, end in drive.until(1045, 1145.5)] == [(1045.0, 5), (1145.0, 10)]
 
 
-def test_a_clean_slice_that_is_nearly_full_enough_is_awaited(street: Window) -> None:
+def test_a_clean_slice_that_is_nearly_full_enough_is_pending(street: Window) -> None:
     drive = Drive(street)
     drive.until(1000, 1025)
     drive.urgency.alarm(since_ns=1000 * S)
@@ -83,7 +83,7 @@ def test_a_clean_slice_that_is_nearly_full_enough_is_awaited(street: Window) -> 
     assert (first[0], first[1].pairs) == (1030.5, 4)
 
 
-def test_a_clean_slice_that_has_just_begun_is_given_up_for_a_dense_one(street: Window) -> None:
+def test_a_clean_slice_that_has_just_started_is_given_up_for_a_dense_one(street: Window) -> None:
     drive = Drive(street)
     drive.until(1000, 1005)
     drive.urgency.alarm(since_ns=1000 * S)
@@ -143,7 +143,7 @@ def test_what_the_rig_wants_is_no_second_window_while_one_is_on_its_way(street: 
     assert [second for second, _ in drive.until(1070, 1200)] == [1070.0, 1090.0, 1190.0]
 
 
-def test_nothing_is_wanted_of_a_time_that_is_no_more(street: Window) -> None:
+def test_nothing_is_requested_of_a_time_that_is_no_more(street: Window) -> None:
     drive = Drive(street)
     drive.until(1000, 1070)
     drive.urgency.request(since_ns=1055 * S, longer_s=0.0)

@@ -60,12 +60,12 @@ def course(drive: Window, depth: DepthModel, change: Change = lambda pair: pair,
     )
     healthy_s, reasons = 0.0, set()
     for pair in drive.pairs:
-        chosen = sampler.offer(change(pair))
-        if chosen is None:
+        selected = sampler.offer(change(pair))
+        if selected is None:
             continue
-        window = Window("check", rig or drive.rig, pose, chosen)
+        window = Window("check", rig or drive.rig, pose, selected)
         observation = observe(window, depth, images, CalibrationConfig(), None)
-        standing = tuple(one.stamp_ns for one in chosen if stands(one, WindowConfig()))
+        standing = tuple(one.stamp_ns for one in selected if stands(one, WindowConfig()))
         state = lifecycle.after_observation(state, replace(observation, standing_stamps_ns=standing), RULES)
         reasons |= {reason.code for reason in state.reasons}
         if state.health is HealthState.HEALTHY:
@@ -113,16 +113,16 @@ def test_a_right_rig_stays_healthy(drive: Window, stereo: DepthModel) -> None:
 def test_stuck_odometry(drive: Window, stereo: DepthModel) -> None:
     pose = drive.T_camera_lidar_start
     after = se3.perturb(pose, np.radians([0.0, 3.0, 0.0, 0.0, 0.0, 0.0]))
-    found = course(drive, stereo, lambda pair: with_points(without_motion(pair), se3.inverse(after) @ pose))
-    assert (found.last is HealthState.HEALTHY, found.healthy_s <= LIMIT_S) == (False, True)
-    assert "ego_motion_wrong" in found.reasons
+    result = course(drive, stereo, lambda pair: with_points(without_motion(pair), se3.inverse(after) @ pose))
+    assert (result.last is HealthState.HEALTHY, result.healthy_s <= LIMIT_S) == (False, True)
+    assert "ego_motion_wrong" in result.reasons
 
 
 @pytest.mark.fault("a LiDAR that is turned by 40° or 180° about its axis", "not healthy after three periods")
 @pytest.mark.parametrize("degrees", [40.0, pytest.param(180.0, marks=pytest.mark.slow)])
 def test_a_turned_lidar(drive: Window, stereo: DepthModel, degrees: float) -> None:
-    found = course(drive, stereo, lambda pair: with_points(pair, turned(degrees)))
-    assert (found.last is HealthState.HEALTHY, found.healthy_s <= LIMIT_S) == (False, True)
+    result = course(drive, stereo, lambda pair: with_points(pair, turned(degrees)))
+    assert (result.last is HealthState.HEALTHY, result.healthy_s <= LIMIT_S) == (False, True)
 
 
 @pytest.mark.fault(
@@ -134,9 +134,9 @@ def test_a_turned_lidar(drive: Window, stereo: DepthModel, degrees: float) -> No
 )
 def test_repeated_frames(drive: Window, stereo: DepthModel, *, camera: bool, standing: bool, code: str) -> None:
     repeated = repeating(drive, camera=camera)
-    found = course(drive, stereo, lambda pair: without_motion(repeated(pair)) if standing else repeated(pair))
-    assert (found.last is HealthState.HEALTHY, found.healthy_s <= LIMIT_S) == (False, True)
-    assert code in found.reasons
+    result = course(drive, stereo, lambda pair: without_motion(repeated(pair)) if standing else repeated(pair))
+    assert (result.last is HealthState.HEALTHY, result.healthy_s <= LIMIT_S) == (False, True)
+    assert code in result.reasons
 
 
 @pytest.mark.fault("a focal length that is 2 % or 5 % wrong", "not healthy after three periods; the lens is named")
@@ -144,10 +144,10 @@ def test_repeated_frames(drive: Window, stereo: DepthModel, *, camera: bool, sta
 def test_a_wrong_focal_length(drive: Window, stereo: DepthModel, factor: float) -> None:
     camera = drive.rig.camera
     rig = replace(drive.rig, camera=camera._replace(fx=factor * camera.fx, fy=factor * camera.fy))
-    found = course(drive, stereo, rig=rig)
-    assert (found.last is HealthState.HEALTHY, found.healthy_s <= LIMIT_S) == (False, True)
-    assert "intrinsics_off" in found.reasons
-    assert found.reasons.isdisjoint({"time_offset", "ego_motion_wrong"})
+    result = course(drive, stereo, rig=rig)
+    assert (result.last is HealthState.HEALTHY, result.healthy_s <= LIMIT_S) == (False, True)
+    assert "intrinsics_off" in result.reasons
+    assert result.reasons.isdisjoint({"time_offset", "ego_motion_wrong"})
 
 
 @pytest.mark.fault("a mount that swings by 1.5° about any axis in 2.3 s", "not healthy after four periods")

@@ -27,14 +27,14 @@ class Paraboloid:
         return [self.evaluate(pose) for pose in poses]
 
 
-@pytest.mark.parametrize(("dof", "kept"), [(3, ()), (6, ()), (6, (4,))])
+@pytest.mark.parametrize(("dof", "retained"), [(3, ()), (6, ()), (6, (4,))])
 def test_derivatives_are_those_of_the_axes_that_were_searched(
-    dof: int, kept: tuple[int, ...], rng: np.random.Generator
+    dof: int, retained: tuple[int, ...], rng: np.random.Generator
 ) -> None:
     root = rng.normal(size=(6, 6))
     square, maximum = root @ root.T + np.eye(6), 1e-4 * rng.normal(size=6)
-    shape = measure_curvature(Paraboloid(square, maximum), np.eye(4), dof, kept)
-    moved = [axis for axis in range(dof) if axis not in kept]
+    shape = measure_curvature(Paraboloid(square, maximum), np.eye(4), dof, retained)
+    moved = [axis for axis in range(dof) if axis not in retained]
     still = [axis for axis in range(6) if axis not in moved]
     np.testing.assert_allclose(shape.first_derivative[moved], (square @ maximum)[moved], rtol=1e-3, atol=1e-9)
     np.testing.assert_allclose(shape.second_derivative[moved], np.diag(square)[moved], rtol=1e-3)

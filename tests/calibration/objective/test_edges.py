@@ -35,7 +35,7 @@ def with_camera(window: Window, camera: Camera) -> EdgeCue:
     """The edges of one pair, seen through another lens in an image of noise."""
     pair, rig = window.pairs[0], replace(window.rig, camera=camera, mask=None)
     grey = np.random.default_rng(0).integers(0, 255, (camera.height, camera.width)).astype(np.uint8)
-    return build_edges([pair], lambda _, chosen: pair.lidar.xyz_m[chosen], [grey], rig)
+    return build_edges([pair], lambda _, selected: pair.lidar.xyz_m[selected], [grey], rig)
 
 
 def pinhole(width: int, height: int, focal_px: float) -> Camera:
@@ -96,11 +96,11 @@ def test_maps_are_those_of_the_images(sharp_street: Window, sharp_edges: EdgeCue
 def test_points_are_the_range_edges_where_they_were_at_the_exposure(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     first = sharp_edges.sharp.first_point
     for f, pair in enumerate(sharp_street.pairs):
-        found = range_edges(pair.lidar.xyz_m, pair.lidar.ring)
+        result = range_edges(pair.lidar.xyz_m, pair.lidar.ring)
         cloud = compensate(pair, sharp_street.rig, enabled=True)
-        at_m = cloud[found.index] + found.shift_m
+        at_m = cloud[result.index] + result.shift_m
         np.testing.assert_array_equal(sharp_edges.sharp.xyz_m[:, first[f] : first[f + 1]].T, at_m)
-        np.testing.assert_array_equal(sharp_edges.sharp.weight[first[f] : first[f + 1]], found.weight)
+        np.testing.assert_array_equal(sharp_edges.sharp.weight[first[f] : first[f + 1]], result.weight)
 
 
 def test_charts_are_of_the_coarse_bands_with_all_of_their_points_or_some(sharp_edges: EdgeCue) -> None:
@@ -138,7 +138,7 @@ def test_an_image_of_another_size_is_refused(street: Window, grown: tuple[int, i
     pair, camera = street.pairs[0], street.rig.camera
     grey = np.zeros((camera.height + grown[0], camera.width + grown[1]), np.uint8)
     with pytest.raises(CalibrationError, match="px, the camera model"):
-        build_edges([pair], lambda _, chosen: pair.lidar.xyz_m[chosen], [grey], street.rig)
+        build_edges([pair], lambda _, selected: pair.lidar.xyz_m[selected], [grey], street.rig)
 
 
 def test_a_mask_hides_pixels_on_every_level(street: Window) -> None:
@@ -147,14 +147,14 @@ def test_a_mask_hides_pixels_on_every_level(street: Window) -> None:
     mask[camera.height // 2 :] = False
     rig: Rig = replace(street.rig, mask=mask)
     pair = street.pairs[0]
-    edges = build_edges([pair], lambda _, chosen: pair.lidar.xyz_m[chosen], [GREY.grey(pair.camera)], rig)
+    edges = build_edges([pair], lambda _, selected: pair.lidar.xyz_m[selected], [GREY.grey(pair.camera)], rig)
     for frames in (edges.sharp, edges.whole, *edges.bands):
         height = frames.maps.shape[1]
         assert (frames.maps[0, -(height // 2) :] == VOID).all()
         assert (frames.maps[0, : height // 2] != VOID).all()
 
 
-def test_the_witness_alone_is_an_objective_whose_score_is_the_significance() -> None:
+def test_the_cue_alone_is_an_objective_whose_score_is_the_significance() -> None:
     camera = build("pinhole", width=40, height=30, fx=30.0, fy=30.0, cx=19.5, cy=14.5)
     rng = np.random.default_rng(7)
     # Pixels at integers, where both ways to look up a pixel agree.

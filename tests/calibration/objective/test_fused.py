@@ -74,13 +74,13 @@ def mutual_information_of(window: Window, depth: DepthModel) -> MutualInformatio
 
 
 @pytest.fixture(scope="module")
-def depth_witness(sharp_street: Window, stereo: DepthModel) -> MutualInformation:
+def depth_cue(sharp_street: Window, stereo: DepthModel) -> MutualInformation:
     return mutual_information_of(sharp_street, stereo)
 
 
 @pytest.fixture(scope="module")
-def fusion(sharp_street: Window, sharp_edges: EdgeCue, depth_witness: MutualInformation) -> Fusion:
-    return Fusion(sharp_edges, depth_witness, sharp_street.T_camera_lidar_start, REACH)
+def fusion(sharp_street: Window, sharp_edges: EdgeCue, depth_cue: MutualInformation) -> Fusion:
+    return Fusion(sharp_edges, depth_cue, sharp_street.T_camera_lidar_start, REACH)
 
 
 @pytest.fixture(scope="module")
@@ -118,17 +118,17 @@ def z_of(edges: EdgeFrames, pose: Matrix4) -> float:
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 0.4, 3.0, 20.0])
-def test_the_score_is_the_sum_of_both_witnesses_in_their_own_standard_deviations(
+def test_the_score_is_the_sum_of_both_cues_in_their_own_standard_deviations(
     sharp_street: Window,
     sharp_edges: EdgeCue,
-    depth_witness: MutualInformation,
+    depth_cue: MutualInformation,
     fusion: Fusion,
     turn_deg: float,
 ) -> None:
     pose = from_start(sharp_street, 1, turn_deg).T_camera_lidar_start
     others = sample_reach(sharp_street.T_camera_lidar_start, REACH, OTHER_POSES)
-    other_mi = np.array([depth_witness.evaluate(other).score for other in others])
-    of_depth = (depth_witness.evaluate(pose).score - other_mi.mean()) / other_mi.std()
+    other_mi = np.array([depth_cue.evaluate(other).score for other in others])
+    of_depth = (depth_cue.evaluate(pose).score - other_mi.mean()) / other_mi.std()
     for objective, edges in zip(fusion.settling, (sharp_edges.whole, sharp_edges.sharp), strict=True):
         z = significances(edges, others)
         expected = (z_of(edges, pose) - z.mean()) / z.std() + of_depth
@@ -170,11 +170,11 @@ def test_its_cells_sum_to_the_objective_but_for_a_constant(sharp_street: Window,
     assert in_front.mean() > 0.9
 
 
-def test_what_is_said_about_depth_is_what_the_depth_witness_says(
-    sharp_street: Window, depth_witness: MutualInformation, fused: FusedObjective
+def test_what_is_reported_about_depth_is_what_the_depth_cue_reports(
+    sharp_street: Window, depth_cue: MutualInformation, fused: FusedObjective
 ) -> None:
     pose = from_start(sharp_street, 3, 2.0).T_camera_lidar_start
-    alone, both = depth_witness.evaluate(pose), fused.evaluate(pose)
+    alone, both = depth_cue.evaluate(pose), fused.evaluate(pose)
     assert (both.mi, both.overlap, both.points_in_view) == (alone.mi, alone.overlap, alone.points_in_view)
 
 
@@ -252,7 +252,7 @@ def test_a_window_that_shows_nothing_leaves_a_known_start_where_it_was(sharp_str
     assert error_deg(known) < 3.0 < error_deg(guess)
 
 
-def test_a_knock_is_found_although_the_start_was_known(sharp_street: Window, stereo: DepthModel) -> None:
+def test_a_displacement_is_detected_although_the_start_was_known(sharp_street: Window, stereo: DepthModel) -> None:
     estimate = solve(replace(from_start(sharp_street, 1, 25.0), start_known_to_rad=MOUNT_RAD), stereo)
     assert error_deg(estimate) < 0.5
 
@@ -265,13 +265,13 @@ def test_same_input_same_bits(sharp_street: Window, stereo: DepthModel) -> None:
     assert first.verdict == second.verdict
 
 
-def test_a_network_that_tells_nothing_does_not_lead_out_of_the_basin_of_the_edges(
+def test_a_network_without_information_does_not_lead_out_of_the_basin_of_the_edges(
     sharp_street: Window, stereo: DepthModel
 ) -> None:
     start = from_start(sharp_street, 8, 5.0)
     informed, uninformed = solve(start, stereo), solve(start, Noise())
-    apart = informed.optimum.T_camera_lidar @ se3.inverse(uninformed.optimum.T_camera_lidar)
-    assert se3.rotation_angle_rad(apart) < SAME_BASIN_RAD
+    separation = informed.optimum.T_camera_lidar @ se3.inverse(uninformed.optimum.T_camera_lidar)
+    assert se3.rotation_angle_rad(separation) < SAME_BASIN_RAD
     # Walls and poles tell the yaw by their upright edges, which needs no depth.
     assert np.degrees(abs(uninformed.correction[1])) < 0.3
 
@@ -335,7 +335,7 @@ def test_a_start_beyond_the_reach_of_the_truth_ends_at_the_rim_or_is_refused(
     assert is_accounted_for(estimate)
 
 
-def test_the_verdict_tells_how_far_the_answer_stands_out(sharp_street: Window, stereo: DepthModel) -> None:
+def test_the_verdict_reports_how_far_the_answer_stands_out(sharp_street: Window, stereo: DepthModel) -> None:
     metrics = {metric.name: metric for metric in solve(from_start(sharp_street, 1, 5.0), stereo).verdict.metrics}
     limits = FUSED.verdict
     assert (metrics["edge_contrast"].limit, metrics["edge_contrast"].at_least) == (limits.min_edge_contrast, True)
@@ -344,7 +344,7 @@ def test_the_verdict_tells_how_far_the_answer_stands_out(sharp_street: Window, s
     assert metrics["runner_up"].value >= 0.0
 
 
-def test_what_cannot_be_chance_to_one_witness_outranks_two_poor_showings(
+def test_what_cannot_be_chance_to_one_cue_outranks_two_poor_showings(
     fusion: Fusion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In a garage with a network that has never seen one, a plain sum preferred 3.2 + 2.4 to 6.6 - 1.1."""

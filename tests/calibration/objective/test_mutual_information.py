@@ -81,7 +81,7 @@ def points_of(window: Window, every: int) -> list[Points]:
     return [distances(pair.lidar.xyz_m[::every], window.T_camera_lidar_start) for pair in window.pairs]
 
 
-def test_the_same_points_tell_the_same_near_a_pose(objective: MutualInformation, street: Window) -> None:
+def test_the_same_points_give_the_same_near_a_pose(objective: MutualInformation, street: Window) -> None:
     """All that no pose near by brings into view may be left out."""
     truth, rng = street.T_camera_lidar_start, np.random.default_rng(3)
     points = [
@@ -108,7 +108,7 @@ def test_as_much_is_expected_in_view_as_there_are_points(objective: MutualInform
     assert fewer.evaluate(truth).overlap == pytest.approx(objective.evaluate(truth).overlap, rel=0.02)
 
 
-def test_unrelated_depth_tells_less(objective: MutualInformation, street: Window) -> None:
+def test_unrelated_depth_determines_less(objective: MutualInformation, street: Window) -> None:
     truth = objective.evaluate(street.T_camera_lidar_start)
     assert objective.mi_of_unrelated(street.T_camera_lidar_start) < truth.mi / 1.2
 

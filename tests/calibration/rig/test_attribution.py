@@ -42,7 +42,7 @@ def _named(state: RigState, rig: RigGraph) -> set[str]:
     "sensors of a rig are knocked by 1°", "they are named after five looks of each pair, and no other is"
 )
 @pytest.mark.parametrize("who", [("front",), ("roof",), ("front", "rear")])
-def test_those_that_moved_are_named_and_told_by_how_much(
+def test_those_that_moved_are_named_and_reported_by_how_much(
     who: tuple[str, ...], record_property: Callable[[str, object], None]
 ) -> None:
     rig = graph(STAR)
@@ -58,28 +58,28 @@ def test_those_that_moved_are_named_and_told_by_how_much(
 
 
 @pytest.mark.parametrize("who", [("roof",), ("front", "rear")])
-def test_a_sensor_is_named_by_the_second_answer_that_knows_of_a_new_look_at_it(who: tuple[str, ...]) -> None:
+def test_a_sensor_is_named_by_the_second_answer_that_knows_of_a_new_observation_of_it(who: tuple[str, ...]) -> None:
     rig = graph(STAR)
     state, after, rng = checked_rig(rig, POSES, POSES, rounds=(4, 0)), moved_poses(*who), np.random.default_rng(7)
-    asked: list[RigState] = []
+    requested: list[RigState] = []
     for turn in range(4, 12):
         for place, edge in enumerate(rig.edges):
             before, at_s = state, 5.0 * turn + 0.5 * place
             state = after_edge_observation(state, rig, edge_check(edge, after, at_s, SIGMA * rng.normal(size=6)))
             if state.attributed_ns != before.attributed_ns:
-                asked.append(state)
+                requested.append(state)
     probable = [set(who) <= {name for name, p in one.posterior.sensors.items() if p >= NAMED_AT}
-                for one in asked if one.posterior is not None]  # fmt: skip
-    first_said, first_named = probable.index(True), [one.named for one in asked].index(frozenset(who))
-    assert first_named > first_said, "one answer is none"
-    assert all(one.named <= set(who) for one in asked)
+                for one in requested if one.posterior is not None]  # fmt: skip
+    first_reported, first_named = probable.index(True), [one.named for one in requested].index(frozenset(who))
+    assert first_named > first_reported, "one answer is none"
+    assert all(one.named <= set(who) for one in requested)
 
 
 @pytest.mark.fault(
     "biased looks at one pair of a LiDAR that was knocked",
     "its camera is not named beside the LiDAR, unless its own window says so",
 )
-def test_a_camera_beside_its_one_lidar_is_named_by_a_window_and_not_by_looks() -> None:
+def test_a_camera_next_to_its_one_lidar_is_named_by_a_window_and_not_by_observations() -> None:
     rig = graph(STAR)
     after = moved_poses("front", "roof")
     state = checked_rig(rig, POSES, after, rounds=(4, 12))
@@ -95,7 +95,7 @@ BENT = np.array([radians(0.35), 0.0, radians(-0.3), 0.0, 0.0, 0.0])
 """What looks of a poor street may be off by, all alike."""
 
 
-def test_a_window_that_denies_bent_looks_keeps_a_camera_from_being_named_beside_its_lidar() -> None:
+def test_a_window_that_denies_bent_observations_keeps_a_camera_from_being_named_next_to_its_lidar() -> None:
     rig, rng = graph(STAR), np.random.default_rng(5)
     after, bent = moved_poses("roof"), {**moved_poses("roof"), "front": se3.perturb(POSES["front"], BENT)}
     state = checked_rig(rig, POSES, POSES, rounds=(4, 0))
@@ -109,7 +109,7 @@ def test_a_window_that_denies_bent_looks_keeps_a_camera_from_being_named_beside_
     assert _named(after_window(state, rig, window), rig) == {"roof"}
 
 
-def _looked_at(after: Mapping[str, Matrix4], suspicious: Collection[int]) -> set[str]:
+def _checked_at(after: Mapping[str, Matrix4], suspicious: Collection[int]) -> set[str]:
     """Who is named after ten rounds of looks at the star, of which the front camera's suspect a move in some."""
     rig, rng = graph(STAR), np.random.default_rng(9)
     state = checked_rig(rig, POSES, POSES, rounds=(4, 0))
@@ -127,21 +127,21 @@ def _looked_at(after: Mapping[str, Matrix4], suspicious: Collection[int]) -> set
 )
 def test_a_camera_whose_only_pair_suspects_nothing_is_not_named() -> None:
     bent = {**POSES, "front": se3.perturb(POSES["front"], BENT)}
-    assert _looked_at(bent, range(4, 14)) == {"front"}
-    assert _looked_at(bent, ()) == set()
-    assert _looked_at(bent, (5,)) == set(), "a single bad look that the next ones deny"
+    assert _checked_at(bent, range(4, 14)) == {"front"}
+    assert _checked_at(bent, ()) == set()
+    assert _checked_at(bent, (5,)) == set(), "a single bad look that the next ones deny"
 
 
 def test_a_camera_that_stepped_farther_than_streets_bend_is_named_though_its_pair_suspects_nothing() -> None:
     """What is served was a little off, and the knock went across it."""
-    assert _looked_at(moved_poses("front"), ()) == {"front"}
+    assert _checked_at(moved_poses("front"), ()) == {"front"}
 
 
 FAINT = 40.0
 """Information of faint looks: so many times less."""
 
 
-def _few_looks_before(offset: np.ndarray) -> RigState:
+def _few_observations_before(offset: np.ndarray) -> RigState:
     """A star whose served poses windows told. The front camera's pair was looked at faintly before it moved by an
     offset, and clearly after it: not clearly enough against a bias of its looks."""
     rig, rng = graph(STAR), np.random.default_rng(3)
@@ -163,9 +163,9 @@ def _few_looks_before(offset: np.ndarray) -> RigState:
     "a camera is knocked before a clear look at it, so its looks may be biased",
     "undecided by looks; an accepted window of its pair, compared with the windows of before, names it",
 )
-def test_a_window_compared_with_earlier_windows_tells_what_biased_looks_cannot() -> None:
+def test_a_window_compared_with_earlier_windows_reports_what_biased_observations_cannot() -> None:
     rig, offset = graph(STAR), 0.6 * TURN
-    state = _few_looks_before(offset)
+    state = _few_observations_before(offset)
     assert _named(state, rig) == set()
     edge = rig.edges[0]
     after = {**POSES, "front": se3.perturb(POSES["front"], offset)}
@@ -189,7 +189,7 @@ def test_a_window_of_before_the_step_is_no_answer() -> None:
 
 
 @pytest.mark.fault("bad looks at a camera, then no new look at it", "looks at other sensors do not name the camera")
-def test_an_answer_without_a_new_look_at_a_sensor_is_none() -> None:
+def test_an_answer_without_a_new_observation_of_a_sensor_is_none() -> None:
     rig, rng = graph(STAR), np.random.default_rng(3)
     state = checked_rig(rig, POSES, POSES, rounds=(6, 0))
     front, *others = rig.edges
@@ -215,7 +215,7 @@ def test_nothing_happened_and_nobody_is_named() -> None:
     assert set(_health(checked_rig(rig, POSES, POSES), rig).values()) == {SensorHealth.CALIBRATED}
 
 
-def test_before_the_first_look_nothing_is_known() -> None:
+def test_before_the_first_observation_nothing_is_known() -> None:
     rig = graph(STAR)
     assert set(_health(initial(rig), rig).values()) == {SensorHealth.UNKNOWN}
 
@@ -233,7 +233,7 @@ def test_one_camera_and_one_lidar_are_undecided_whoever_moved(who: str) -> None:
     assert "front" in reasons[1]
 
 
-def test_two_of_three_that_moved_are_not_told_from_the_other_two() -> None:
+def test_two_of_three_that_moved_are_not_distinguished_from_the_other_two() -> None:
     rig = graph(STAR[:2])
     after = {**moved_poses("front"), "left": moved_poses("left", xi=-2.0 * TURN)["left"]}
     state = checked_rig(rig, POSES, after)
@@ -256,7 +256,7 @@ def test_a_pair_that_others_contradict_is_disturbed_and_its_sensors_undecided() 
     assert undecided == {"front", "roof"}
 
 
-def test_a_bar_that_was_knocked_is_one_move_of_all_on_it() -> None:
+def test_a_bar_that_was_displaced_is_one_move_of_all_on_it() -> None:
     rigid = RigidLink("bar", "front", "left", POSES["front"] @ se3.inverse(POSES["left"]), np.full(6, 1e-4))
     rig = graph(STAR, [rigid])
     T_front_rig = se3.perturb(POSES["front"], TURN)

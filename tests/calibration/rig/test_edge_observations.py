@@ -38,12 +38,12 @@ def _observation(offset: np.ndarray, weak: bool = False) -> Observation:
 
 
 def test_a_check_puts_the_pair_where_its_optimum_is() -> None:
-    found = observation_of_check("front-roof", POSE, _observation(TURN))
-    assert found is not None
-    np.testing.assert_allclose(se3.difference(found.T_a_b, POSE), TURN, atol=1e-12)
-    sigma = np.sqrt(1.0 / found.information.diagonal())
+    result = observation_of_check("front-roof", POSE, _observation(TURN))
+    assert result is not None
+    np.testing.assert_allclose(se3.difference(result.T_a_b, POSE), TURN, atol=1e-12)
+    sigma = np.sqrt(1.0 / result.information.diagonal())
     np.testing.assert_allclose(sigma[[0, 2, 3]], SIGMA[[0, 2, 3]], rtol=0.4)  # a little more, as it lies far away
-    np.testing.assert_allclose(found.rig, np.maximum(BIAS, PLACE), rtol=1e-6)
+    np.testing.assert_allclose(result.rig, np.maximum(BIAS, PLACE), rtol=1e-6)
 
 
 def test_a_faint_check_says_less_and_one_of_bad_data_nothing() -> None:
@@ -59,9 +59,9 @@ def test_a_faint_check_says_less_and_one_of_bad_data_nothing() -> None:
 
 def test_a_check_carries_since_when_its_pair_is_suspected_by_itself() -> None:
     for since_ns in (None, 5):
-        found = observation_of_check("e", POSE, _observation(TURN), stepped_ns=since_ns)
-        assert found is not None
-        assert found.stepped_ns == since_ns
+        result = observation_of_check("e", POSE, _observation(TURN), stepped_ns=since_ns)
+        assert result is not None
+        assert result.stepped_ns == since_ns
 
 
 @pytest.mark.fault(
@@ -76,14 +76,14 @@ def test_hostile_checks_say_nothing() -> None:
         observation_of_check("e", np.full((4, 4), np.inf), _observation(TURN))
 
 
-def test_a_window_of_rotations_tells_rotations_and_what_windows_share_counts() -> None:
+def test_a_window_of_rotations_determines_rotations_and_what_windows_share_counts() -> None:
     noise = np.diag([*SIGMA[:3] ** 2, np.nan, np.nan, np.nan])
     noise[3:, :] = noise[:, 3:] = np.nan
     window = Measurement(POSE, Uncertainty(noise, {"lens_down": SIGMA * np.eye(6)[0]}, 9.0), NS)
-    found = observation_of_window("e", window)
-    assert found is not None
-    assert not found.information[3:].any()
-    assert found.information[0, 0] == pytest.approx(1.0 / (2.0 * SIGMA[0] ** 2 + (BIAS_TIMES * BIAS[0]) ** 2))
+    result = observation_of_window("e", window)
+    assert result is not None
+    assert not result.information[3:].any()
+    assert result.information[0, 0] == pytest.approx(1.0 / (2.0 * SIGMA[0] ** 2 + (BIAS_TIMES * BIAS[0]) ** 2))
     assert observation_of_window("e", replace(window, uncertainty=Uncertainty.unknown())) is None
 
 
@@ -101,7 +101,7 @@ def test_a_step_is_the_difference_of_two_robust_means() -> None:
     assert steps.log_stepped[0] > steps.log_stepped[1]  # it was then, and not later
 
 
-def test_old_looks_are_counted_together_in_calm_and_forgotten_in_doubt() -> None:
+def test_old_observations_are_counted_together_in_calm_and_forgotten_in_doubt() -> None:
     rng = np.random.default_rng(2)
     calm = doubt = EdgeHistory.at(EDGE.T_a_b, BIAS)
     for turn in range(3 * MAX_OBSERVATIONS):
@@ -114,14 +114,14 @@ def test_old_looks_are_counted_together_in_calm_and_forgotten_in_doubt() -> None
 
 def window(xi: np.ndarray, sigma: np.ndarray, at_s: float) -> EdgeObservation:
     """An accepted one that puts the edge at ξ from where it was."""
-    found = observation_of_window(
+    result = observation_of_window(
         EDGE.name, Measurement(se3.perturb(EDGE.T_a_b, xi), Uncertainty.independent(sigma), round(at_s * NS))
     )
-    assert found is not None
-    return found
+    assert result is not None
+    return result
 
 
-def test_a_window_against_an_origin_that_windows_told_is_known_better_than_the_bias_of_looks() -> None:
+def test_a_window_against_an_origin_that_windows_reported_is_known_better_than_the_bias_of_observations() -> None:
     known = EdgeHistory.served(EDGE.T_a_b, SIGMA)
     steps = steps_at(known.after(window(TURN, SIGMA, 9.0), calm=True), [5 * NS])
     np.testing.assert_allclose(steps.xi[0], TURN, atol=1e-3)
@@ -135,14 +135,14 @@ def test_what_a_window_says_of_a_step_is_the_integral_over_all_steps() -> None:
     """Of one axis, by the sum over a grid."""
     sigma = np.array([SIGMA[0], *[np.nan] * 5])
     known = EdgeHistory.served(EDGE.T_a_b, sigma)
-    looked = known
+    checked = known
     for turn in range(4):
-        looked = looked.after(edge_check(EDGE, POSES, float(turn), np.zeros(6)), calm=True)
+        checked = checked.after(edge_check(EDGE, POSES, float(turn), np.zeros(6)), calm=True)
     for off in (0.0, 2.0 * SIGMA[0], 8.0 * TURN[1]):
         seen = window(np.array([off, *[0.0] * 5]), sigma, 9.0)
         before, after = (
-            (steps_at(looked, [20 * NS, 2 * NS])),
-            steps_at(looked.after(seen, calm=True), [20 * NS, 2 * NS]),
+            (steps_at(checked, [20 * NS, 2 * NS])),
+            steps_at(checked.after(seen, calm=True), [20 * NS, 2 * NS]),
         )
         density = np.log(normal(off, 2.0 * SIGMA[0] ** 2) * (1.0 - BAD_SHARE) + normal(off, REACH[0] ** 2) * BAD_SHARE)
         assert after.log_still - before.log_still == pytest.approx(density, abs=1e-6)
@@ -158,7 +158,7 @@ def normal(x: np.ndarray | float, variance: float) -> np.ndarray:
     return np.asarray(np.exp(-0.5 * np.square(x) / variance) / np.sqrt(2.0 * np.pi * variance))
 
 
-def test_a_window_that_contradicts_all_looks_moves_no_step() -> None:
+def test_a_window_that_contradicts_all_observations_moves_no_step() -> None:
     known = EdgeHistory.served(EDGE.T_a_b, SIGMA)
     for turn in range(8):
         known = known.after(edge_check(EDGE, POSES, float(turn), np.zeros(6)), calm=True)
@@ -167,7 +167,7 @@ def test_a_window_that_contradicts_all_looks_moves_no_step() -> None:
     assert steps.observations[0] == pytest.approx(4.0, abs=0.2)
 
 
-def test_among_looks_that_all_contradict_each_other_a_window_tells_the_right_one() -> None:
+def test_among_observations_that_all_contradict_each_other_a_window_determines_the_right_one() -> None:
     rng, known = np.random.default_rng(4), EdgeHistory.served(EDGE.T_a_b, SIGMA)
     for turn in range(4):
         known = known.after(edge_check(EDGE, POSES, float(turn), SIGMA * rng.normal(size=6)), calm=True)

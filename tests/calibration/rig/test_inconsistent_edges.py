@@ -32,16 +32,16 @@ def driven() -> RigDrive:
     "a LiDAR is knocked between two looks at it and another",
     "`health` gives one reason at a time, never `inconsistent_rig`",
 )
-def test_from_the_knock_to_the_correction_one_thing_is_said_at_a_time(
+def test_from_the_displacement_to_the_correction_one_thing_is_reported_at_a_time(
     record_property: Callable[[str, object], None],
 ) -> None:
     drive, after = driven(), moved_poses("roof")
-    knocked_s = drive.at_s
-    said: list[dict[str, RigAlarm]] = []
+    displaced_s = drive.at_s
+    reported: list[dict[str, RigAlarm]] = []
 
     def note() -> None:
-        if not said or said[-1] != dict(rig_alarms(drive.state)):
-            said.append(dict(rig_alarms(drive.state)))
+        if not reported or reported[-1] != dict(rig_alarms(drive.state)):
+            reported.append(dict(rig_alarms(drive.state)))
 
     drive.add_lidar_check(EDGE, after)
     note()
@@ -55,27 +55,27 @@ def test_from_the_knock_to_the_correction_one_thing_is_said_at_a_time(
         if drive.state.event is not None:
             break
     assert drive.health()["roof"] is SensorHealth.LIDAR_MOVED
-    assert said[-1] == dict.fromkeys(OF_ROOF, RigAlarm.MOVED)
-    named_s = drive.at_s - knocked_s
+    assert reported[-1] == dict.fromkeys(OF_ROOF, RigAlarm.MOVED)
+    named_s = drive.at_s - displaced_s
     texts = rig_problems(drive.state)["front-roof"]
     assert [reason.code for reason in texts] == [MOVED]
     assert texts[0].text.startswith("roof moved")
     drive.add_checks(after, 3)
     for name in sorted(OF_ROOF):
-        drive.add_window(name, after, knocked_s + 1.0)
+        drive.add_window(name, after, displaced_s + 1.0)
         note()
     drive.add_checks(after, 3)
     drive.add_lidar_check(EDGE, after)
     drive.add_checks(after, 3)
     drive.add_lidar_check(EDGE, after)
     note()
-    assert said[-1] == {}
-    assert not any(RigAlarm.INCONSISTENT in one.values() for one in said), said
+    assert reported[-1] == {}
+    assert not any(RigAlarm.INCONSISTENT in one.values() for one in reported), reported
     assert drive.state.correction is not None
     record_property("figure", f"named after {named_s:.0f} s")
 
 
-def test_one_bad_look_at_two_lidars_is_held_against_nobody() -> None:
+def test_one_bad_observation_of_two_lidars_is_held_against_nobody() -> None:
     drive = driven()
     drive.add_lidar_check(EDGE, moved_poses(), TURN)
     assert rig_alarms(drive.state) == {}
@@ -87,7 +87,7 @@ def test_one_bad_look_at_two_lidars_is_held_against_nobody() -> None:
 @pytest.mark.fault(
     "one of two LiDARs is knocked while no camera sees anything", "either is suspected, without `inconsistent_rig`"
 )
-def test_while_nothing_tells_which_of_two_moved_it_is_a_suspicion() -> None:
+def test_while_nothing_determines_which_of_two_moved_it_is_a_suspicion() -> None:
     drive, after = driven(), moved_poses("roof")
     for _ in range(3):
         drive.add_lidar_check(EDGE, after)
@@ -106,6 +106,6 @@ def test_windows_that_contradict_each_other_while_nothing_moved_are_inconsistent
     drive.add_window(
         "left-roof", {**moved_poses(), "left": moved_poses("left", xi=3.0 * TURN)["left"]}, drive.at_s - 20.0
     )
-    found = rig_alarms(drive.state)
-    assert set(np.unique([one.value for one in found.values()])) <= {"inconsistent", "suspected"}
-    assert "left-roof" in found
+    result = rig_alarms(drive.state)
+    assert set(np.unique([one.value for one in result.values()])) <= {"inconsistent", "suspected"}
+    assert "left-roof" in result

@@ -37,27 +37,27 @@ def test_two_cameras_on_a_bar_close_and_keep_what_they_have_in_common(
     sample_data: Path, record_property: Callable[[str, object], None]
 ) -> None:
     cameras = ("image_00", "image_01")
-    told = {
+    reported = {
         name: _calibrated(f"kitti360:{sample_data / 'kitti360'}?drive=2013_05_28_drive_0000_sync&camera={name}")
         for name in cameras
     }
-    built = {name: reference for name, (_, reference) in told.items()}
+    built = {name: reference for name, (_, reference) in reported.items()}
     T_1_0 = built["image_01"] @ se3.inverse(built["image_00"])
     assert np.linalg.norm(T_1_0[:3, 3]) == pytest.approx(0.594, abs=0.01)
     sensors = [*(Sensor(name, SensorKind.CAMERA) for name in cameras), Sensor("velodyne", SensorKind.LIDAR)]
     edges = [Edge(name, name, "velodyne", built[name]) for name in cameras]
     rig = RigGraph.of(sensors, edges, [RigidLink("bar", "image_01", "image_00", T_1_0, BAR)])
-    seen = {name: window for name, (window, _) in told.items()}
-    found = estimate_jointly(rig, seen)
+    seen = {name: window for name, (window, _) in reported.items()}
+    result = estimate_jointly(rig, seen)
     alone = {name: se3.difference(seen[name].T_camera_lidar, built[name])[:3] for name in cameras}
-    joined = {name: se3.difference(found.T_a_b[name], built[name])[:3] for name in cameras}
-    apart = {
+    joined = {name: se3.difference(result.T_a_b[name], built[name])[:3] for name in cameras}
+    separation = {
         how: np.degrees(np.linalg.norm(xi["image_01"] - xi["image_00"]))
         for how, xi in (("alone", alone), ("joined", joined))
     }
     common = np.degrees(np.linalg.norm(sum(joined.values()) / 2.0 - sum(alone.values()) / 2.0))
-    closed = f"apart {apart['alone']:.3f}° alone, {apart['joined']:.3f}° joined"
+    closed = f"apart {separation['alone']:.3f}° alone, {separation['joined']:.3f}° joined"
     record_property("figure", f"{closed}; common offset moved {common:.3f}°")
-    assert found.consistent
-    assert apart["joined"] < 0.03
+    assert result.consistent
+    assert separation["joined"] < 0.03
     assert common < 0.03

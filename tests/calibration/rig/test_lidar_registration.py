@@ -29,11 +29,11 @@ class BruteForce:
 
     def nearest(self, queries_m: Doubles, count: int) -> tuple[NDArray[np.int64], Doubles]:
         points = self._points_m
-        apart = (queries_m**2).sum(axis=1)[:, None] + (points**2).sum(axis=1) - 2.0 * queries_m @ points.T
-        found = np.argpartition(apart, count - 1, axis=1)[:, :count]
-        squared = np.take_along_axis(apart, found, axis=1)
+        separation = (queries_m**2).sum(axis=1)[:, None] + (points**2).sum(axis=1) - 2.0 * queries_m @ points.T
+        detected = np.argpartition(separation, count - 1, axis=1)[:, :count]
+        squared = np.take_along_axis(separation, detected, axis=1)
         order = np.argsort(squared, axis=1, kind="stable")
-        return np.take_along_axis(found, order, axis=1), np.take_along_axis(squared, order, axis=1)
+        return np.take_along_axis(detected, order, axis=1), np.take_along_axis(squared, order, axis=1)
 
 
 class Search:
@@ -100,8 +100,8 @@ def edge(pairs: list[SweepPair], off: Doubles) -> LidarEdge:
     return register(LidarRig("a", "b", se3.perturb(T_A_B, off), T_A_EGO), pairs, Search())
 
 
-def error(found: LidarEdge) -> Doubles:
-    return se3.difference(found.T_a_b, T_A_B)
+def error(detected: LidarEdge) -> Doubles:
+    return se3.difference(detected.T_a_b, T_A_B)
 
 
 KNOCK = np.array([0.0, 0.0, np.deg2rad(1.0), 0.0, 0.0, 0.0])
@@ -113,21 +113,21 @@ def in_a_room() -> LidarEdge:
     return edge(drive(room, 1), FAR)
 
 
-def test_the_pose_is_found_from_two_degrees_and_ten_centimetres_away() -> None:
-    found = in_a_room()
-    assert not found.reasons
-    assert np.rad2deg(np.abs(error(found)[:3])).max() < 0.06
-    assert np.abs(error(found)[3:]).max() < 0.01
-    assert np.abs(error(found) / found.sigma).max() < 3.5
-    assert found.rms_m == pytest.approx(NOISE_M, rel=0.3)
-    np.testing.assert_allclose(found.correction, se3.difference(found.T_a_b, found.rig.T_a_b_nominal))
+def test_the_pose_is_detected_from_two_degrees_and_ten_centimetres_away() -> None:
+    detected = in_a_room()
+    assert not detected.reasons
+    assert np.rad2deg(np.abs(error(detected)[:3])).max() < 0.06
+    assert np.abs(error(detected)[3:]).max() < 0.01
+    assert np.abs(error(detected) / detected.sigma).max() < 3.5
+    assert detected.rms_m == pytest.approx(NOISE_M, rel=0.3)
+    np.testing.assert_allclose(detected.correction, se3.difference(detected.T_a_b, detected.rig.T_a_b_nominal))
 
 
 def test_a_knock_of_one_degree_is_the_correction_and_its_absence_is_none() -> None:
     pairs = drive(room, 2, pairs=2)
-    knocked, calm = edge(pairs, KNOCK), edge(pairs, np.zeros(6))
-    assert np.rad2deg(knocked.correction[2]) == pytest.approx(-1.0, abs=0.1)
-    assert knocked.chi2 > 200.0
+    displaced, calm = edge(pairs, KNOCK), edge(pairs, np.zeros(6))
+    assert np.rad2deg(displaced.correction[2]) == pytest.approx(-1.0, abs=0.1)
+    assert displaced.chi2 > 200.0
     assert calm.chi2 < 30.0
 
 
@@ -143,9 +143,9 @@ def test_moving_b_by_s_moves_its_pose_by_the_inverse() -> None:
     before = register(LidarRig("a", "b", T_A_B, T_A_EGO), pairs, Search())
     after = register(LidarRig("a", "b", T_A_B @ se3.inverse(shift), T_A_EGO), moved, Search())
     # Another choice of points, one in every cube, is another draw of the noise.
-    apart = se3.difference(after.T_a_b @ shift, before.T_a_b)
-    assert np.rad2deg(np.abs(apart[:3])).max() < 0.1
-    assert np.abs(apart[3:]).max() < 0.015
+    separation = se3.difference(after.T_a_b @ shift, before.T_a_b)
+    assert np.rad2deg(np.abs(separation[:3])).max() < 0.1
+    assert np.abs(separation[3:]).max() < 0.015
 
 
 def test_the_pose_of_a_in_b_is_the_inverse() -> None:
@@ -157,31 +157,31 @@ def test_the_pose_of_a_in_b_is_the_inverse() -> None:
     there = register(LidarRig("a", "b", start, T_A_EGO), [SweepPair(a, b, None)], Search())
     T_b_ego = se3.inverse(T_A_B) @ T_A_EGO
     back = register(LidarRig("b", "a", se3.inverse(start), T_b_ego), [SweepPair(b, a, None)], Search())
-    apart = se3.difference(there.T_a_b, se3.inverse(back.T_a_b))
+    separation = se3.difference(there.T_a_b, se3.inverse(back.T_a_b))
     # Points of the one on planes of the other, and the other way round: not the same draw of the noise.
     sigma = np.hypot(there.sigma, (np.abs(se3.adjoint(there.T_a_b)) @ back.sigma))
-    assert (np.abs(apart) < 3.0 * sigma).all()
-    assert np.rad2deg(np.abs(apart[:3])).max() < 0.2
+    assert (np.abs(separation) < 3.0 * sigma).all()
+    assert np.rad2deg(np.abs(separation[:3])).max() < 0.2
 
 
 def test_along_a_corridor_nothing_is_claimed() -> None:
     """Normals that scatter must not pass for a wall across."""
     along, up = T_A_EGO[:3, 0], T_A_EGO[:3, 2]
-    found = edge(drive(corridor, 4, pairs=2), np.concatenate([np.zeros(3), 0.2 * along]))
-    sigma_m = float(np.sqrt(along @ found.covariance[3:, 3:] @ along))
+    detected = edge(drive(corridor, 4, pairs=2), np.concatenate([np.zeros(3), 0.2 * along]))
+    sigma_m = float(np.sqrt(along @ detected.covariance[3:, 3:] @ along))
     assert sigma_m > 0.1
-    assert abs(error(found)[3:] @ along) < 3.0 * sigma_m
+    assert abs(error(detected)[3:] @ along) < 3.0 * sigma_m
     for axis in (np.cross(along, up), up):
-        assert float(np.sqrt(axis @ found.covariance[3:, 3:] @ axis)) < 0.03
+        assert float(np.sqrt(axis @ detected.covariance[3:, 3:] @ axis)) < 0.03
     held = in_a_room()
     assert float(np.sqrt(along @ held.covariance[3:, 3:] @ along)) < 0.03
 
 
-def test_a_range_bias_is_told_and_does_not_bend_the_pose() -> None:
-    found = edge(drive(room, 5, longer_m=0.05), np.zeros(6))
-    assert found.range_bias.longer_m == pytest.approx(0.05, abs=3.5 * found.range_bias.sigma_m)
-    assert found.range_bias.sigma_m < 0.015
-    assert np.abs(error(found)[3:]).max() < 0.02
+def test_a_range_bias_is_reported_and_does_not_bend_the_pose() -> None:
+    detected = edge(drive(room, 5, longer_m=0.05), np.zeros(6))
+    assert detected.range_bias.longer_m == pytest.approx(0.05, abs=3.5 * detected.range_bias.sigma_m)
+    assert detected.range_bias.sigma_m < 0.015
+    assert np.abs(error(detected)[3:]).max() < 0.02
 
 
 def test_the_same_view_again_is_no_further_evidence() -> None:
@@ -190,7 +190,7 @@ def test_the_same_view_again_is_no_further_evidence() -> None:
     assert (again.sigma / alone.sigma).min() > 0.7
 
 
-def test_sweeps_are_brought_to_one_instant_through_the_mount_that_is_found() -> None:
+def test_sweeps_are_brought_to_one_instant_through_the_mount_that_is_detected() -> None:
     """b is 40 ms later and turned by 2° from where it was mounted: taken through its nominal mount, its points would
     lie 2 cm aside."""
     motion = EgoMotion(0, "ego", (15.0, 0.0, 0.0), (0.0, 0.0, 0.3))
@@ -203,17 +203,17 @@ def test_sweeps_are_brought_to_one_instant_through_the_mount_that_is_found() -> 
             room(rng, 900), se3.inverse(T_A_B) @ T_A_EGO, "b", rng, after_s=late, motion=motion, stamp_ns=40_000_000
         )
         pairs.append(SweepPair(a, b, motion))
-    found = edge(pairs, 2.0 * KNOCK)
-    assert np.rad2deg(np.abs(error(found)[:3])).max() < 0.12
-    assert np.abs(error(found)[3:]).max() < 0.012
+    detected = edge(pairs, 2.0 * KNOCK)
+    assert np.rad2deg(np.abs(error(detected)[:3])).max() < 0.12
+    assert np.abs(error(detected)[3:]).max() < 0.012
 
 
-def test_what_sees_nothing_in_common_is_refused_in_words() -> None:
+def test_what_sees_nothing_in_common_is_refused_as_text() -> None:
     far = [SweepPair(p.a, LidarFrame(0, "b", p.b.xyz_m + np.float32(100.0)), None) for p in drive(room, 8, pairs=1)]
-    found = edge(far, np.zeros(6))
-    assert [reason.code for reason in found.reasons] == ["lidar_overlap"]
-    assert "too little in view in common" in found.reasons[0].text
-    assert found.sigma[0] > np.deg2rad(5.0)
+    detected = edge(far, np.zeros(6))
+    assert [reason.code for reason in detected.reasons] == ["lidar_overlap"]
+    assert "too little in view in common" in detected.reasons[0].text
+    assert detected.sigma[0] > np.deg2rad(5.0)
     with pytest.raises(ValueError, match="no sweep"):
         edge([], np.zeros(6))
 
@@ -227,6 +227,6 @@ def test_points_that_lie_anywhere_do_not_pull() -> None:
         wrong = rng.random(len(xyz)) < 0.33
         xyz[wrong] *= rng.uniform(0.5, 0.95, (wrong.sum(), 1)).astype(np.float32)
         pairs.append(SweepPair(pair.a, LidarFrame(0, "b", xyz), None))
-    found = edge(pairs, FAR)
-    assert np.rad2deg(np.abs(error(found)[:3])).max() < 0.15
-    assert np.abs(error(found)[3:]).max() < 0.02
+    detected = edge(pairs, FAR)
+    assert np.rad2deg(np.abs(error(detected)[:3])).max() < 0.15
+    assert np.abs(error(detected)[3:]).max() < 0.02

@@ -45,17 +45,22 @@ def arrivals(until_s: float, phase_ns: int = 30_000_000) -> list[Arrival]:
     )
 
 
-def stamps(found: SampledSweeps) -> list[tuple[int, int]]:
-    return [(pair.a.stamp_ns, pair.b.stamp_ns) for look in found if isinstance(look, SweepSet) for pair in look.pairs]
+def stamps(result: SampledSweeps) -> list[tuple[int, int]]:
+    return [
+        (pair.a.stamp_ns, pair.b.stamp_ns)
+        for observation in result
+        if isinstance(observation, SweepSet)
+        for pair in observation.pairs
+    ]
 
 
-def test_a_look_is_of_two_pairs_at_the_beginning_of_each_period() -> None:
+def test_a_observation_is_of_two_pairs_at_the_beginning_of_each_period() -> None:
     of = sampler()
-    found = [one for stream, stamp_ns in arrivals(40.0) for one in push(of, stream, stamp_ns)]
+    result = [one for stream, stamp_ns in arrivals(40.0) for one in push(of, stream, stamp_ns)]
     near_ns = 30_000_000
     expected = [at_s * NS for at_s in (0, 2, 15, 17, 30, 32)]
-    assert stamps(found) == [(at_ns, at_ns + near_ns) for at_ns in expected]
-    assert (found[1].start_ns, found[1].stamp_ns) == (15 * NS, 17 * NS)  # type: ignore[union-attr]
+    assert stamps(result) == [(at_ns, at_ns + near_ns) for at_ns in expected]
+    assert (result[1].start_ns, result[1].stamp_ns) == (15 * NS, 17 * NS)  # type: ignore[union-attr]
     assert not of.losses
 
 
@@ -64,59 +69,59 @@ def test_the_order_in_which_streams_come_changes_nothing(seed: int) -> None:
     rng = random.Random(seed)
     late_ns = {stream: rng.randrange(900_000_000) for stream in ("a", "b", "ego")}
     mixed = sorted(arrivals(50.0), key=lambda one: one[1] + late_ns[one[0]])
-    found, of = [], sampler()
+    result, of = [], sampler()
     for stream, stamp_ns in mixed:
-        found += push(of, stream, stamp_ns)
+        result += push(of, stream, stamp_ns)
         assert of.held <= SWEEPS_HELD + CANDIDATES_HELD + 2 * PAIRS
     plain = [one for each in [sampler()] for stream, at_ns in arrivals(50.0) for one in push(each, stream, at_ns)]
-    assert stamps(found) == stamps(plain)
+    assert stamps(result) == stamps(plain)
 
 
 @pytest.mark.fault("one of two LiDARs falls silent", "a bounded number of sweeps of the other is kept")
 @pytest.mark.parametrize("silent", ["a", "b", "ego"])
 def test_what_is_held_is_bounded_whatever_falls_silent(silent: str) -> None:
-    of, most, found = sampler(), 0, []
+    of, most, result = sampler(), 0, []
     for stream, stamp_ns in arrivals(100.0):
         if stream != silent:
-            found += push(of, stream, stamp_ns)
+            result += push(of, stream, stamp_ns)
             most = max(most, of.held)
     assert most <= SWEEPS_HELD + CANDIDATES_HELD
-    assert {one.cause for one in found if isinstance(one, MissedSweep)} == {"a": set(), "b": {"no_sweep"}}.get(
+    assert {one.cause for one in result if isinstance(one, MissedSweep)} == {"a": set(), "b": {"no_sweep"}}.get(
         silent, {"no_ego_motion"}
     )
 
 
 def test_a_standing_vehicle_and_points_without_time_are_missed_by_cause() -> None:
-    of, found = sampler(), []
+    of, result = sampler(), []
     for stream, stamp_ns in arrivals(10.0):
-        found += push(of, stream, stamp_ns, speed_mps=0.1)
-    assert [one.cause for one in found if isinstance(one, MissedSweep)] == ["standing", "standing"]
-    of, found = sampler(timed_a=True), []
+        result += push(of, stream, stamp_ns, speed_mps=0.1)
+    assert [one.cause for one in result if isinstance(one, MissedSweep)] == ["standing", "standing"]
+    of, result = sampler(timed_a=True), []
     for stream, stamp_ns in arrivals(10.0):
-        found += push(of, stream, stamp_ns, timed=stream != "a")
-    assert len(stamps(found)) == PAIRS
-    of, found = sampler(timed_b=True), []
+        result += push(of, stream, stamp_ns, timed=stream != "a")
+    assert len(stamps(result)) == PAIRS
+    of, result = sampler(timed_b=True), []
     for stream, stamp_ns in arrivals(10.0):
-        found += push(of, stream, stamp_ns, timed=stream != "a")
-    assert [one.cause for one in found if isinstance(one, MissedSweep)] == ["no_point_time"] * 2
+        result += push(of, stream, stamp_ns, timed=stream != "a")
+    assert [one.cause for one in result if isinstance(one, MissedSweep)] == ["no_point_time"] * 2
 
 
 def test_sensor_time_that_steps_back_begins_anew() -> None:
     of = sampler()
     for stream, stamp_ns in arrivals(16.0):
         push(of, stream, 1000 * NS + stamp_ns)
-    found = [one for stream, stamp_ns in arrivals(10.0) for one in push(of, stream, 5 * NS + 10 * NS + stamp_ns)]
+    result = [one for stream, stamp_ns in arrivals(10.0) for one in push(of, stream, 5 * NS + 10 * NS + stamp_ns)]
     # Five frames have to agree on the new time, which are half a second.
-    assert stamps(found) == []
-    found = [one for stream, stamp_ns in arrivals(10.0) for one in push(of, stream, 30 * NS + stamp_ns)]
-    assert [a_ns for a_ns, _ in stamps(found)] == [30 * NS, 32 * NS]
+    assert stamps(result) == []
+    result = [one for stream, stamp_ns in arrivals(10.0) for one in push(of, stream, 30 * NS + stamp_ns)]
+    assert [a_ns for a_ns, _ in stamps(result)] == [30 * NS, 32 * NS]
 
 
 def test_a_single_stamp_from_another_time_harms_nothing() -> None:
-    of, found = sampler(), []
+    of, result = sampler(), []
     for stream, stamp_ns in arrivals(40.0):
         if stream == "a" and stamp_ns == 15 * NS:
-            found += push(of, "a", 9000 * NS)
-            found += push(of, "a", -9000 * NS)
-        found += push(of, stream, stamp_ns)
-    assert [a_ns // NS for a_ns, _ in stamps(found)] == [0, 2, 15, 17, 30, 32]
+            result += push(of, "a", 9000 * NS)
+            result += push(of, "a", -9000 * NS)
+        result += push(of, stream, stamp_ns)
+    assert [a_ns // NS for a_ns, _ in stamps(result)] == [0, 2, 15, 17, 30, 32]

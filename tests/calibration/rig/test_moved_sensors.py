@@ -45,7 +45,7 @@ def test_sets_are_as_likely_against_each_other_as_sampling_says() -> None:
         )
         for place, edge in enumerate(rig.edges)
     }
-    found = who_moved(rig, steps)
+    result = who_moved(rig, steps)
     scales = [MOUNT_RAD / normal_quantile(0.5 + 0.5 * (k + 0.5) / SCALES) for k in range(SCALES)]
     sampled = {}
     for number, mover in enumerate(moving):
@@ -56,11 +56,11 @@ def test_sets_are_as_likely_against_each_other_as_sampling_says() -> None:
             away = seen - np.einsum("eij,nj->nei", design[number], x)
             likelihoods.append(np.exp(_log_normal(away).sum(axis=1)).mean())
         sampled[mover.sensors] = float(np.mean(likelihoods))
-    told = {sensors: p for sensors, p in found.sets if len(sensors) == 1}
-    best = max(told, key=lambda sensors: told[sensors])
+    reported = {sensors: p for sensors, p in result.sets if len(sensors) == 1}
+    best = max(reported, key=lambda sensors: reported[sensors])
     assert best == ("roof",)
-    for sensors, p in told.items():
-        assert log(p / told[best]) == pytest.approx(log(sampled[sensors] / sampled[best]), abs=0.15)
+    for sensors, p in reported.items():
+        assert log(p / reported[best]) == pytest.approx(log(sampled[sensors] / sampled[best]), abs=0.15)
 
 
 def test_patterns_are_how_poses_step_as_sensors_move() -> None:
@@ -73,7 +73,7 @@ def test_patterns_are_how_poses_step_as_sensors_move() -> None:
             np.testing.assert_allclose(of @ xi, stepped, atol=1e-10)
 
 
-def test_edges_that_nobody_looked_at_since_speak_neither_for_nor_against_a_sensor() -> None:
+def test_edges_that_nobody_checked_since_speak_neither_for_nor_against_a_sensor() -> None:
     """An edge between two LiDARs stepped after the last look at any camera. The one has three of these, the other one:
     that makes neither likelier."""
     rig = graph([*STAR, ("front", "bumper"), ("roof", "bumper")])
@@ -81,7 +81,7 @@ def test_edges_that_nobody_looked_at_since_speak_neither_for_nor_against_a_senso
     likely = float(_log_normal(np.zeros(6)))
     still = EdgeSteps(np.zeros((2, 6)), rounds, np.array([0.0, 3.0]), np.array([0.0, -700.0]), np.zeros(2), likely)
     seen = EdgeSteps(step, rounds, np.ones(2), np.full(2, -700.0), np.zeros(2), float(_log_normal(step[0])))
-    found = who_moved(rig, {edge.name: seen if edge.name == "roof-bumper" else still for edge in rig.edges})
-    assert log(found.sensors["roof"] / found.sensors["bumper"]) == pytest.approx(0.0, abs=1.0)
-    assert found.sensors["roof"] + found.sensors["bumper"] > 0.8
-    assert found.when == 0
+    result = who_moved(rig, {edge.name: seen if edge.name == "roof-bumper" else still for edge in rig.edges})
+    assert log(result.sensors["roof"] / result.sensors["bumper"]) == pytest.approx(0.0, abs=1.0)
+    assert result.sensors["roof"] + result.sensors["bumper"] > 0.8
+    assert result.when == 0

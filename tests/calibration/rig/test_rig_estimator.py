@@ -30,12 +30,12 @@ from support.rigs import (
 
 
 @pytest.mark.fault("the LiDAR of a rig is knocked by 1°", "one event, one correction for all of its cameras")
-def test_a_knocked_lidar_is_put_right_in_all_its_pairs_at_once(
+def test_a_displaced_lidar_is_put_right_in_all_its_pairs_at_once(
     record_property: Callable[[str, object], None],
 ) -> None:
     drive, after = RigDrive(graph(STAR)), moved_poses("roof")
     drive.add_checks(POSES, 8)
-    knocked_s = drive.at_s
+    displaced_s = drive.at_s
     drive.add_checks(after, 4)
     assert drive.health() == {
         "front": SensorHealth.CALIBRATED,
@@ -45,16 +45,16 @@ def test_a_knocked_lidar_is_put_right_in_all_its_pairs_at_once(
     }
     assert drive.state.correction is None
     for name in ("front-roof", "left-roof"):
-        drive.add_window(name, after, knocked_s + 6.0)
+        drive.add_window(name, after, displaced_s + 6.0)
     assert drive.state.correction is None
-    drive.add_window("rear-roof", after, knocked_s + 6.0)
+    drive.add_window("rear-roof", after, displaced_s + 6.0)
     correction = drive.state.correction
     assert correction is not None
     assert correction.sensors == ("roof",)
     assert set(correction.pairs) == {"front-roof", "left-roof", "rear-roof"}
-    for name, told in correction.pairs.items():
-        away = se3.difference(told.T_a_b, pose_of(drive.state.graph.edge[name], after))
-        assert float(away @ np.linalg.solve(told.covariance, away)) < 22.5  # 99.9 % of six axes
+    for name, reported in correction.pairs.items():
+        away = se3.difference(reported.T_a_b, pose_of(drive.state.graph.edge[name], after))
+        assert float(away @ np.linalg.solve(reported.covariance, away)) < 22.5  # 99.9 % of six axes
     drive.add_checks(after, 3)
     assert drive.state.event is None
     assert set(drive.health().values()) == {SensorHealth.CALIBRATED}
@@ -71,54 +71,55 @@ def moves_of_the_lidar(drive: RigDrive) -> list[Matrix4]:
     assert correction is not None
     edges = drive.state.graph.edge
     return [
-        np.asarray(se3.inverse(pose_of(edges[name], POSES)) @ told.T_a_b) for name, told in correction.pairs.items()
+        np.asarray(se3.inverse(pose_of(edges[name], POSES)) @ reported.T_a_b)
+        for name, reported in correction.pairs.items()
     ]
 
 
-def test_all_pairs_of_a_knocked_lidar_are_told_nearly_one_move() -> None:
+def test_all_pairs_of_a_displaced_lidar_are_reported_nearly_one_move() -> None:
     drive, after = RigDrive(graph(STAR)), moved_poses("roof")
     drive.add_checks(POSES, 8)
-    knocked_s = drive.at_s
+    displaced_s = drive.at_s
     drive.add_checks(after, 4)
-    own = {edge.name: drive.add_window(edge.name, after, knocked_s + 6.0) for edge in drive.state.graph.edges}
-    apart = [se3.difference(move, moves_of_the_lidar(drive)[0]) for move in moves_of_the_lidar(drive)[1:]]
+    own = {edge.name: drive.add_window(edge.name, after, displaced_s + 6.0) for edge in drive.state.graph.edges}
+    separation = [se3.difference(move, moves_of_the_lidar(drive)[0]) for move in moves_of_the_lidar(drive)[1:]]
     edges = drive.state.graph.edge
     of_windows = [np.asarray(se3.inverse(pose_of(edges[name], POSES)) @ pose) for name, pose in own.items()]
-    apart_alone = [se3.difference(move, of_windows[0]) for move in of_windows[1:]]
-    assert np.linalg.norm(apart) < 0.5 * np.linalg.norm(apart_alone)
+    separation_alone = [se3.difference(move, of_windows[0]) for move in of_windows[1:]]
+    assert np.linalg.norm(separation) < 0.5 * np.linalg.norm(separation_alone)
     drive.add_checks(after, 3)
     assert drive.state.event is None
     assert drive.state.before is None, "it is over: what is served now is what is known"
-    assert all(one.stamp_ns > round(knocked_s * NS) for of in drive.state.known.values() for one in of)
+    assert all(one.stamp_ns > round(displaced_s * NS) for of in drive.state.known.values() for one in of)
 
 
 @pytest.mark.fault("two pairs of a knocked LiDAR tell different moves of it", "`inconsistent_rig`; each keeps its own")
-def test_windows_that_tell_different_moves_are_put_together_by_nobody() -> None:
+def test_windows_that_report_different_moves_are_put_together_by_nobody() -> None:
     drive, after = RigDrive(graph(STAR[:2])), moved_poses("roof")
     drive.add_checks(POSES, 8)
-    knocked_s = drive.at_s
+    displaced_s = drive.at_s
     drive.add_checks(after, 6)
-    drive.add_window("front-roof", after, knocked_s + 6.0)
-    drive.add_window("left-roof", {**after, "left": moved_poses("left")["left"]}, knocked_s + 6.0)
+    drive.add_window("front-roof", after, displaced_s + 6.0)
+    drive.add_window("left-roof", {**after, "left": moved_poses("left")["left"]}, displaced_s + 6.0)
     assert drive.state.correction is None
     assert set(misfits(drive.state)) == {"front-roof", "left-roof"}
 
 
-def test_what_was_found_of_after_a_knock_before_it_was_named_is_not_taken_for_before() -> None:
+def test_what_was_discovered_of_after_a_displacement_before_it_was_named_is_not_taken_for_before() -> None:
     drive, after = RigDrive(graph(STAR)), moved_poses("roof")
     drive.add_checks(POSES, 8)
-    knocked_s = drive.at_s
+    displaced_s = drive.at_s
     drive.add_checks(after, 1)
     edge = drive.state.graph.edge["front-roof"]
-    found = ServedEdge(pose_of(edge, after), SIGMA, round(knocked_s * NS), known_of(edge, after, drive.at_s))
-    drive.state = rig_estimator.after_served(drive.state, edge.name, found, round(drive.at_s * NS))
+    result = ServedEdge(pose_of(edge, after), SIGMA, round(displaced_s * NS), known_of(edge, after, drive.at_s))
+    drive.state = rig_estimator.after_served(drive.state, edge.name, result, round(drive.at_s * NS))
     drive.add_checks(after, 3)
     before = drive.state.before
     assert before is not None
     assert set(before.edges) == {"front-roof", "left-roof", "rear-roof"}
     for name, one in before.edges.items():
         np.testing.assert_array_equal(one.T_camera_lidar, pose_of(drive.state.graph.edge[name], POSES))
-        assert one.stamp_ns < round(knocked_s * NS)
+        assert one.stamp_ns < round(displaced_s * NS)
 
 
 def test_a_pair_whose_two_sensors_both_moved_is_one_that_moved() -> None:
@@ -131,10 +132,10 @@ def test_a_pair_whose_two_sensors_both_moved_is_one_that_moved() -> None:
 def test_windows_that_began_before_the_move_put_nothing_right() -> None:
     drive, after = RigDrive(graph(STAR)), moved_poses("roof")
     drive.add_checks(POSES, 8)
-    knocked_s = drive.at_s
+    displaced_s = drive.at_s
     drive.add_checks(after, 4)
     for edge in drive.state.graph.edges:
-        drive.add_window(edge.name, POSES, knocked_s - 20.0)
+        drive.add_window(edge.name, POSES, displaced_s - 20.0)
     assert drive.state.correction is None
     assert drive.health()["roof"] is SensorHealth.LIDAR_MOVED
     assert not drive.state.windows
@@ -143,15 +144,15 @@ def test_windows_that_began_before_the_move_put_nothing_right() -> None:
 def test_it_stays_moved_for_as_long_as_a_pair_serves_what_was_before() -> None:
     drive, after = RigDrive(graph(STAR)), moved_poses("roof")
     drive.add_checks(POSES, 8)
-    knocked_s = drive.at_s
+    displaced_s = drive.at_s
     drive.add_checks(after, 4)
     for edge in drive.state.graph.edges:
-        drive.add_window(edge.name, after, knocked_s + 6.0, serves=edge.name != "left-roof")
+        drive.add_window(edge.name, after, displaced_s + 6.0, serves=edge.name != "left-roof")
     assert drive.state.correction is not None
     drive.add_checks(after, 6)
     assert drive.health()["roof"] is SensorHealth.LIDAR_MOVED
-    told = drive.state.correction.pairs["left-roof"]
-    served = ServedEdge(told.T_a_b, SIGMA, round((knocked_s + 6.0) * NS))
+    reported = drive.state.correction.pairs["left-roof"]
+    served = ServedEdge(reported.T_a_b, SIGMA, round((displaced_s + 6.0) * NS))
     drive.state = rig_estimator.after_served(drive.state, "left-roof", served, round(drive.at_s * NS))
     drive.add_checks(after, 1)
     assert drive.health()["roof"] is SensorHealth.CALIBRATED
@@ -160,18 +161,18 @@ def test_it_stays_moved_for_as_long_as_a_pair_serves_what_was_before() -> None:
 @pytest.mark.fault(
     "one camera sees nothing when its LiDAR is knocked", "the others determine where the LiDAR is for its pair"
 )
-def test_a_pair_that_is_blind_is_not_waited_for_and_told_by_the_others() -> None:
+def test_a_pair_that_is_blind_is_not_waited_for_and_reported_by_the_others() -> None:
     drive, after = RigDrive(graph(STAR)), moved_poses("roof")
     drive.add_checks(POSES, 8)
     drive.add_checks(POSES, 13, blind=("rear-roof",))
-    knocked_s = drive.at_s
+    displaced_s = drive.at_s
     drive.add_checks(after, 4, blind=("rear-roof",))
     for name in ("front-roof", "left-roof"):
-        drive.add_window(name, after, knocked_s + 6.0)
+        drive.add_window(name, after, displaced_s + 6.0)
     assert drive.state.correction is not None
-    told = drive.state.correction.pairs["rear-roof"]
-    away = se3.difference(told.T_a_b, pose_of(drive.state.graph.edge["rear-roof"], after))
-    assert float(away @ np.linalg.solve(told.covariance, away)) < 22.5  # 99.9 % of six axes
+    reported = drive.state.correction.pairs["rear-roof"]
+    away = se3.difference(reported.T_a_b, pose_of(drive.state.graph.edge["rear-roof"], after))
+    assert float(away @ np.linalg.solve(reported.covariance, away)) < 22.5  # 99.9 % of six axes
     assert np.degrees(np.abs(away[:3]).max()) < 0.2, "of 1°"
 
 
@@ -181,11 +182,11 @@ def test_a_pair_that_is_blind_is_not_waited_for_and_told_by_the_others() -> None
 def test_a_camera_whose_pair_repairs_itself_at_once_is_named_all_the_same() -> None:
     drive, after = RigDrive(graph(STAR)), moved_poses("front")
     drive.add_checks(POSES, 8)
-    knocked_s = drive.at_s
+    displaced_s = drive.at_s
     drive.add_checks(after, 2)
     assert drive.state.move is None, "looks alone say too little yet"
     edge = drive.state.graph.edge["front-roof"]
-    window = windowed_measurement(edge, after, knocked_s, SIGMA)
+    window = windowed_measurement(edge, after, displaced_s, SIGMA)
     drive.state = rig_estimator.after_window(drive.state, edge.name, window, round(drive.at_s * NS))
     assert drive.health()["front"] is SensorHealth.CAMERA_MOVED
     move = drive.state.move
@@ -203,7 +204,7 @@ def test_a_camera_whose_pair_repairs_itself_at_once_is_named_all_the_same() -> N
     assert move.over_ns == round((drive.at_s - 15.0) * NS), "what was is still told"
 
 
-def test_a_window_that_looks_of_its_own_time_deny_names_nobody() -> None:
+def test_a_window_that_observations_of_its_own_time_deny_names_nobody() -> None:
     drive = RigDrive(graph(STAR))
     drive.add_checks(POSES, 8)
     drive.add_window("front-roof", moved_poses("front"), drive.at_s - 20.0, serves=False)
@@ -213,13 +214,13 @@ def test_a_window_that_looks_of_its_own_time_deny_names_nobody() -> None:
     assert drive.state.move is None
 
 
-def test_what_nobody_can_attribute_is_over_when_its_pair_serves_what_it_found() -> None:
+def test_what_nobody_can_attribute_is_over_when_its_pair_serves_what_it_discovered() -> None:
     drive, after = RigDrive(graph(STAR[:1])), moved_poses("front", xi=3.0 * TURN)
     drive.add_checks(POSES, 8)
-    knocked_s = drive.at_s
+    displaced_s = drive.at_s
     drive.add_checks(after, 4)
     assert set(drive.health().values()) == {SensorHealth.UNDECIDED}
-    drive.add_window("front-roof", after, knocked_s + 6.0)
+    drive.add_window("front-roof", after, displaced_s + 6.0)
     drive.add_checks(after, 2)
     assert set(drive.health().values()) == {SensorHealth.CALIBRATED}
 
@@ -227,7 +228,7 @@ def test_what_nobody_can_attribute_is_over_when_its_pair_serves_what_it_found() 
 @pytest.mark.fault(
     "a window of one pair of a rig is 1° off", "`inconsistent_rig` for the pairs of its loop; nothing is corrected"
 )
-def test_a_window_that_does_not_fit_the_others_is_said_of_the_pairs_of_its_loop() -> None:
+def test_a_window_that_does_not_fit_the_others_is_reported_for_the_pairs_of_its_loop() -> None:
     drive = RigDrive(graph(LOOPS))
     drive.add_checks(POSES, 4)
     assert misfits(drive.state) == ()

@@ -34,44 +34,44 @@ def turned(edges: EdgeCue, first: int, last: int, T_before: Matrix4, T_after: Ma
 
 
 def test_a_mount_that_stays_gains_nothing(sharp_street: Window, sharp_edges: EdgeCue) -> None:
-    found = change_point(sharp_edges, sharp_street.T_camera_lidar_start)
-    assert found is not None
-    assert found.gain < 0.5 * LIMITS.max_change_gain
+    result = change_point(sharp_edges, sharp_street.T_camera_lidar_start)
+    assert result is not None
+    assert result.gain < 0.5 * LIMITS.max_change_gain
 
 
 @pytest.mark.parametrize(
     ("first_late", "size_deg"), [(9, 3.0), (8, 1.5), (7, 0.5), (6, 0.3), (5, 0.5), (3, 3.0), (2, 1.0)]
 )
-def test_a_knock_is_found_where_and_when_it_was(
+def test_a_displacement_is_detected_where_and_when_it_was(
     sharp_street: Window, sharp_edges: EdgeCue, first_late: int, size_deg: float
 ) -> None:
     T_before = sharp_street.T_camera_lidar_start
     T_after = away_from(T_before, size_deg, seed=first_late)
     # The solve ends where most of the frames are.
     solved = T_before if first_late >= 5 else T_after
-    found = change_point(turned(sharp_edges, first_late, 10, T_before, T_after), solved)
-    assert found is not None
-    assert found.gain > LIMITS.max_change_gain
-    assert found.of_camera
-    assert found.first_late == first_late
+    result = change_point(turned(sharp_edges, first_late, 10, T_before, T_after), solved)
+    assert result is not None
+    assert result.gain > LIMITS.max_change_gain
+    assert result.of_camera
+    assert result.first_late == first_late
     # Two frames alone tell a pose to half a degree.
-    assert angle_deg(found.T_before, T_before) < 0.6
-    assert angle_deg(found.T_after, T_after) < 0.6
-    assert np.degrees(found.turn_rad) == pytest.approx(size_deg, abs=0.6)
+    assert angle_deg(result.T_before, T_before) < 0.6
+    assert angle_deg(result.T_after, T_after) < 0.6
+    assert np.degrees(result.turn_rad) == pytest.approx(size_deg, abs=0.6)
 
 
 def test_one_bad_frame_is_no_knock(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     pose = sharp_street.T_camera_lidar_start
-    found = change_point(turned(sharp_edges, 4, 5, pose, away_from(pose, 2.0, seed=1)), pose)
-    assert found is not None
-    assert found.gain < LIMITS.max_change_gain
+    result = change_point(turned(sharp_edges, 4, 5, pose, away_from(pose, 2.0, seed=1)), pose)
+    assert result is not None
+    assert result.gain < LIMITS.max_change_gain
 
 
 def test_frames_that_fit_nothing_are_no_knock(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     pose = sharp_street.T_camera_lidar_start
-    found = change_point(turned(sharp_edges, 6, 10, pose, away_from(pose, 90.0, seed=2)), pose)
-    assert found is not None
-    assert not (found.of_camera and found.gain > LIMITS.max_change_gain)
+    result = change_point(turned(sharp_edges, 6, 10, pose, away_from(pose, 90.0, seed=2)), pose)
+    assert result is not None
+    assert not (result.of_camera and result.gain > LIMITS.max_change_gain)
 
 
 def test_same_input_same_bits(sharp_street: Window, sharp_edges: EdgeCue) -> None:

@@ -78,7 +78,7 @@ def test_no_pose_of_the_reach_is_far_from_the_cover() -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_the_true_basin_is_found_from_twenty_degrees_away(
+def test_the_true_basin_is_detected_from_twenty_degrees_away(
     sharp_street: Window, sharp_edges: EdgeCue, seed: int
 ) -> None:
     truth = sharp_street.rig.T_camera_lidar_nominal
@@ -88,13 +88,13 @@ def test_the_true_basin_is_found_from_twenty_degrees_away(
     assert nearest_deg < 1.5 * np.degrees(sharp_edges.band_blur_rad[1])
 
 
-def test_the_true_translation_is_found_from_half_a_metre_away(sample_data: Path) -> None:
+def test_the_true_translation_is_detected_from_half_a_metre_away(sample_data: Path) -> None:
     """On real streets: they tell height, and are cheaper here than a drawn one of their resolution."""
     window = window_of(open_source(f"kitti360:{sample_data}/kitti360?camera=image_00"))
     images = GreyImages(LimitsConfig())
     edges = build_edges(
         window.pairs,
-        lambda frame, chosen: compensate(window.pairs[frame], window.rig, enabled=True, selection=chosen),
+        lambda frame, selected: compensate(window.pairs[frame], window.rig, enabled=True, selection=selected),
         [images.grey(pair.camera) for pair in window.pairs],
         window.rig,
     )
@@ -164,7 +164,7 @@ def test_what_lies_next_to_a_pose_is_the_true_basin_from_a_degree_away(
 def test_edges_out_of_reach_are_nothing_to_the_bit(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     start = away_from(sharp_street.rig.T_camera_lidar_nominal, 9.0, 1)
     charts = sharp_edges.charts[FINE]
-    kept = in_reach(charts, sharp_edges.half_view_rad, start, BOTH)
-    assert kept.xyz_m.shape[1] < charts.xyz_m.shape[1]
+    retained = in_reach(charts, sharp_edges.half_view_rad, start, BOTH)
+    assert retained.xyz_m.shape[1] < charts.xyz_m.shape[1]
     poses = sample_reach(start, BOTH, 200)
-    assert charted_significances(kept, poses).tolist() == charted_significances(charts, poses).tolist()
+    assert charted_significances(retained, poses).tolist() == charted_significances(charts, poses).tolist()

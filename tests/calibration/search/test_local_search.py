@@ -37,31 +37,31 @@ class Hill:
         return [self.evaluate(pose) for pose in poses]
 
 
-def apart_deg(found: SearchResult, hill: Hill) -> float:
-    return float(np.degrees(np.abs(se3.difference(found.T_camera_lidar, START) - hill.top)[:3].max()))
+def separation_deg(result: SearchResult, hill: Hill) -> float:
+    return float(np.degrees(np.abs(se3.difference(result.T_camera_lidar, START) - hill.top)[:3].max()))
 
 
 @pytest.mark.parametrize("top_deg", [(0.0, 0.0, 0.0), (6.0, -7.0, 4.0), (-9.0, 1.0, 9.0)])
-def test_the_top_is_found_anywhere_in_the_box(top_deg: tuple[float, float, float]) -> None:
+def test_the_top_is_detected_anywhere_in_the_box(top_deg: tuple[float, float, float]) -> None:
     hill = Hill(top_deg)
-    found = maximise(hill, START, THREE, Silence())
-    assert found.stop_reason is StopReason.TOLERANCE
-    assert apart_deg(found, hill) < 0.01
-    assert found.evaluations == len(hill.visited)
+    result = maximise(hill, START, THREE, Silence())
+    assert result.stop_reason is StopReason.TOLERANCE
+    assert separation_deg(result, hill) < 0.01
+    assert result.evaluations == len(hill.visited)
 
 
-def test_the_same_hill_is_climbed_the_same_way() -> None:
+def test_the_same_hill_is_ascended_the_same_way() -> None:
     first, second = Hill((3.0, 2.0, -4.0)), Hill((3.0, 2.0, -4.0))
     ends = [maximise(hill, START, THREE, Silence()).T_camera_lidar for hill in (first, second)]
     assert ends[0].tobytes() == ends[1].tobytes()
     np.testing.assert_array_equal(first.visited, second.visited)
 
 
-def test_nothing_outside_of_the_box_is_visited_and_its_rim_is_told() -> None:
-    outside = Hill((2.0 * THREE.rotation_deg, 0.0, 0.0), width_rad=0.5)
-    found = maximise(outside, START, THREE, Silence())
-    assert found.stop_reason is StopReason.AT_BOUND
-    rotations_deg = np.degrees(np.abs(outside.visited))[:, :3]
+def test_nothing_beyond_the_box_is_visited_and_its_rim_is_reported() -> None:
+    context = Hill((2.0 * THREE.rotation_deg, 0.0, 0.0), width_rad=0.5)
+    result = maximise(context, START, THREE, Silence())
+    assert result.stop_reason is StopReason.AT_BOUND
+    rotations_deg = np.degrees(np.abs(context.visited))[:, :3]
     assert rotations_deg.max() <= np.sqrt(3.0) * THREE.rotation_deg + 1e-6
 
 
@@ -72,14 +72,14 @@ def test_three_degrees_of_freedom_leave_the_translation() -> None:
 
 
 def test_evaluations_run_out() -> None:
-    found = maximise(Hill((6.0, 6.0, 6.0)), START, THREE.model_copy(update={"max_evaluations": 20}), Silence())
-    assert found.stop_reason is StopReason.EVALUATIONS
+    result = maximise(Hill((6.0, 6.0, 6.0)), START, THREE.model_copy(update={"max_evaluations": 20}), Silence())
+    assert result.stop_reason is StopReason.EVALUATIONS
 
 
-def test_a_basin_is_polished_but_for_the_axes_that_are_kept() -> None:
+def test_a_basin_is_polished_but_for_the_axes_that_are_retained() -> None:
     hill = Hill((1.0, -1.5, 2.0), (0.1, -0.05, 0.0))
-    found = polish(hill, START, SIX, Silence(), constraint=FixedCentre((3, 4, 5), START))
-    assert apart_deg(found, hill) < 0.01
+    result = polish(hill, START, SIX, Silence(), constraint=FixedCentre((3, 4, 5), START))
+    assert separation_deg(result, hill) < 0.01
     np.testing.assert_allclose(np.array(hill.visited)[:, 3:], 0.0, atol=1e-9)
 
 
@@ -88,16 +88,16 @@ def test_levels_in_turn_end_on_the_last_in_fewer_evaluations() -> None:
         return [Hill((2.0, -2.0, 1.0)), Hill((2.3, -1.8, 1.1), width_rad=0.05), Hill((2.2, -1.9, 1.0), width_rad=0.02)]
 
     hills = levels()
-    found = polish_in_turn(hills, START, THREE, Silence())
-    assert apart_deg(found, hills[-1]) < 0.01
-    assert found.evaluations == sum(len(hill.visited) for hill in hills)
+    result = polish_in_turn(hills, START, THREE, Silence())
+    assert separation_deg(result, hills[-1]) < 0.01
+    assert result.evaluations == sum(len(hill.visited) for hill in hills)
     each_to_the_end = polish(levels()[0], START, THREE, Silence())
     for hill in levels()[1:]:
         each_to_the_end = polish(hill, each_to_the_end.T_camera_lidar, THREE, Silence(), each_to_the_end.evaluations)
-    assert found.evaluations < each_to_the_end.evaluations
+    assert result.evaluations < each_to_the_end.evaluations
 
 
-def test_near_is_a_share_of_the_hill_and_never_nearer_than_asked() -> None:
+def test_near_is_a_share_of_the_hill_and_never_nearer_than_requested() -> None:
     hill = Hill((0.5, 0.5, -0.5))
     roughly = near(THREE, hill)
     assert roughly.tolerance_deg == pytest.approx(NEAR * np.degrees(hill.step_rad))

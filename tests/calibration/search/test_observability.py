@@ -81,14 +81,14 @@ def test_the_centre_stays_where_the_start_had_it_however_the_start_was_turned(
     slid = LEVER_ARM.copy()
     slid[axis - 3, 3] += 0.5
     search = SearchResult(se3.perturb(slid, np.array([0.01, -0.02, 0.01, 0.0, 0.0, 0.0])), 7, StopReason.TOLERANCE)
-    found = without((axis,), search, valley, start, SIX, Silence())
-    pose = found.T_camera_lidar
+    result = without((axis,), search, valley, start, SIX, Silence())
+    pose = result.T_camera_lidar
     shift = centre_m(pose) - centre_m(start)
     assert abs(along_m(pose, axis, shift)) < 1e-9
     assert se3.rotation_angle_rad(pose @ se3.inverse(LEVER_ARM)) < np.radians(0.01)
     off = centre_m(pose) - centre_m(LEVER_ARM)
     assert np.linalg.norm(off - (off @ flat) * flat) < 1e-3
-    assert found.evaluations > 7
+    assert result.evaluations > 7
 
 
 def test_putting_the_centre_back_leaves_the_rotation_and_the_other_axes() -> None:
@@ -128,7 +128,7 @@ def solve(window: Window, depth: DepthModel, start: Matrix4, config: Calibration
 
 
 @pytest.mark.parametrize("turned", [turned_about_camera, pytest.param(turned_about_lidar, marks=pytest.mark.slow)])
-def test_the_kept_axis_of_a_calibration_is_that_of_its_start(
+def test_the_retained_axis_of_a_calibration_is_that_of_its_start(
     sharp_street: Window, stereo: DepthModel, turned: Turned
 ) -> None:
     """Metamorphic: a start that is turned moves no axis that is reported as kept. The limit is put where this street
@@ -136,12 +136,12 @@ def test_the_kept_axis_of_a_calibration_is_that_of_its_start(
     config = CalibrationConfig(search=SIX, verdict=VerdictConfig(max_sigma_m=0.0036))
     start = turned(sharp_street.rig.T_camera_lidar_nominal, TURN)
     estimate = solve(sharp_street, stereo, start, config)
-    kept = np.flatnonzero(estimate.unobservable)
-    assert len(kept)
-    assert not estimate.solved[kept].any()
-    assert np.isnan(estimate.sigma[kept]).all()
+    retained = np.flatnonzero(estimate.unobservable)
+    assert len(retained)
+    assert not estimate.solved[retained].any()
+    assert np.isnan(estimate.sigma[retained]).all()
     pose = estimate.optimum.T_camera_lidar
-    for axis in kept.tolist():
+    for axis in retained.tolist():
         assert abs(along_m(pose, axis, centre_m(pose) - centre_m(start))) < 1e-3
         if turned is turned_about_camera:  # the start itself has the centre of the truth
             assert abs(estimate.correction[axis]) < 1e-3

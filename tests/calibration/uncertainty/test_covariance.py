@@ -32,14 +32,14 @@ def square_of(rng: np.random.Generator) -> Array:
     return root @ root.T + np.eye(3)
 
 
-@pytest.mark.parametrize("drawn", [moving, standing])
+@pytest.mark.parametrize("rendered", [moving, standing])
 def test_three_sigma_cover_whether_the_vehicle_drives_or_stands(
-    drawn: Callable[[np.random.Generator], Array], rng: np.random.Generator
+    rendered: Callable[[np.random.Generator], Array], rng: np.random.Generator
 ) -> None:
     """The truth is at zero; the optimum is the mean of the cells' maxima."""
     square, normalised = square_of(rng), []
     for _ in range(60):
-        maxima = drawn(rng)
+        maxima = rendered(rng)
         optimum = maxima.mean(axis=(0, 1))
         noise = measure_noise(landscape(paraboloids(square, maxima - optimum)))
         assert noise is not None
@@ -49,18 +49,18 @@ def test_three_sigma_cover_whether_the_vehicle_drives_or_stands(
     assert ((spread > 0.4) & (spread < 1.1)).all()
 
 
-def test_looks_are_the_frames_of_a_drive_and_one_of_a_standing_vehicle(rng: np.random.Generator) -> None:
+def test_observations_are_the_frames_of_a_drive_and_one_of_a_standing_vehicle(rng: np.random.Generator) -> None:
     square = square_of(rng)
 
-    def looks(maxima: Array) -> float:
+    def observations(maxima: Array) -> float:
         noise = measure_noise(landscape(paraboloids(square, maxima - maxima.mean(axis=(0, 1)))))
         assert noise is not None
         return noise.independent_samples
 
-    assert looks(moving(rng)) > 0.6 * FRAMES
-    assert looks(standing(rng)) < 1.5
+    assert observations(moving(rng)) > 0.6 * FRAMES
+    assert observations(standing(rng)) < 1.5
     half = np.concatenate([standing(rng)[: FRAMES // 2], moving(rng)[: FRAMES // 2]])
-    assert 1.5 < looks(half) < 0.6 * FRAMES
+    assert 1.5 < observations(half) < 0.6 * FRAMES
 
 
 def test_the_scatter_of_sums_is_that_of_their_frames_and_of_their_sectors(rng: np.random.Generator) -> None:
@@ -96,7 +96,7 @@ def test_views_that_come_again_settle_no_more_axes_than_they_are(
     assert measure_noise(landscape(paraboloids(np.eye(axes), one_more), axes)) is not None
 
 
-def test_a_dent_at_the_top_of_a_hill_is_looked_past(rng: np.random.Generator) -> None:
+def test_a_dent_at_the_top_of_a_hill_is_passed_over(rng: np.random.Generator) -> None:
     """A ripple as narrow as the first step makes the top a saddle; the hill is told all the same."""
     hill = paraboloids(np.eye(3), moving(rng))
 

@@ -22,7 +22,7 @@ FRAMES = 10
 MOTORWAY = "sim:seed=3&seconds=12&camera_hz=0.5&lidar_hz=0.5&scene=highway&camera=pinhole640x400&lidar=64"
 
 
-def chosen(edges: EdgeFrames, frames: list[int]) -> EdgeFrames:
+def selected(edges: EdgeFrames, frames: list[int]) -> EdgeFrames:
     """The frames with these numbers, in this order; a number may come again."""
     first = edges.first_point
     points = np.concatenate([np.arange(first[f], first[f + 1]) for f in frames])
@@ -46,15 +46,15 @@ def sharp_edges_of(window: Window) -> EdgeFrames:
     ).sharp
 
 
-def test_each_place_of_a_drive_past_facades_is_a_look(sharp_edges: EdgeCue, sharp_street: Window) -> None:
+def test_each_place_of_a_drive_past_facades_is_a_observation(sharp_edges: EdgeCue, sharp_street: Window) -> None:
     seen = independent_samples_at(sharp_edges.sharp, sharp_street.T_camera_lidar_start)
     assert 0.8 * FRAMES < seen.count <= FRAMES
 
 
-def test_ten_frames_of_a_standing_vehicle_are_one_look(sharp_edges: EdgeCue, sharp_street: Window) -> None:
+def test_ten_frames_of_a_standing_vehicle_are_one_observation(sharp_edges: EdgeCue, sharp_street: Window) -> None:
     pose = sharp_street.T_camera_lidar_start
-    once = independent_samples_at(chosen(sharp_edges.sharp, [0]), pose)
-    standing = independent_samples_at(chosen(sharp_edges.sharp, [0] * FRAMES), pose)
+    once = independent_samples_at(selected(sharp_edges.sharp, [0]), pose)
+    standing = independent_samples_at(selected(sharp_edges.sharp, [0] * FRAMES), pose)
     assert once.count == 1.0
     assert standing.count == pytest.approx(1.0, abs=1e-9)
     assert standing.significance == pytest.approx(once.significance, rel=1e-4)
@@ -67,17 +67,19 @@ def test_a_motorway_is_in_between() -> None:
 
 
 @pytest.mark.parametrize("times", [2, 3])
-def test_the_same_frames_again_are_no_further_looks(sharp_edges: EdgeCue, sharp_street: Window, times: int) -> None:
-    frames, pose = chosen(sharp_edges.sharp, [0, 3, 6]), sharp_street.T_camera_lidar_start
-    again = chosen(frames, [0, 1, 2] * times)
+def test_the_same_frames_again_are_no_further_observations(
+    sharp_edges: EdgeCue, sharp_street: Window, times: int
+) -> None:
+    frames, pose = selected(sharp_edges.sharp, [0, 3, 6]), sharp_street.T_camera_lidar_start
+    again = selected(frames, [0, 1, 2] * times)
     assert independent_samples_at(again, pose).count == pytest.approx(
         independent_samples_at(frames, pose).count, rel=1e-9
     )
 
 
-def test_frames_in_reverse_are_the_same_looks(sharp_edges: EdgeCue, sharp_street: Window) -> None:
-    frames, pose = chosen(sharp_edges.sharp, [0, 3, 6, 8]), sharp_street.T_camera_lidar_start
-    backwards = independent_samples_at(chosen(frames, [3, 2, 1, 0]), pose)
+def test_frames_in_reverse_are_the_same_observations(sharp_edges: EdgeCue, sharp_street: Window) -> None:
+    frames, pose = selected(sharp_edges.sharp, [0, 3, 6, 8]), sharp_street.T_camera_lidar_start
+    backwards = independent_samples_at(selected(frames, [3, 2, 1, 0]), pose)
     assert backwards.count == independent_samples_at(frames, pose).count
     assert backwards.significance == pytest.approx(independent_samples_at(frames, pose).significance, rel=1e-6)
 
@@ -94,7 +96,7 @@ def agreement(alike: float, own: float = 5.0) -> NDArray[np.float64]:
     return own * (alike + (1.0 - alike) * np.eye(FRAMES))
 
 
-def test_the_more_stands_still_the_fewer_looks() -> None:
+def test_the_more_stands_still_the_fewer_observations() -> None:
     counts = [effective_sample_size(agreement(alike)) for alike in np.linspace(0.0, 1.0, 21)]
     assert counts[0] == FRAMES
     assert counts[-1] == pytest.approx(1.0)
@@ -102,11 +104,11 @@ def test_the_more_stands_still_the_fewer_looks() -> None:
 
 
 @pytest.mark.parametrize("alike", [-3.0, -0.2, 1.5])
-def test_looks_are_never_more_than_frames_nor_less_than_one(alike: float) -> None:
+def test_observations_are_never_more_than_frames_nor_less_than_one(alike: float) -> None:
     assert effective_sample_size(agreement(alike)) == (FRAMES if alike < 0.0 else 1.0)
 
 
 @pytest.mark.fault("frames that agree nowhere", "they count as one look, and no number ends the service")
 @pytest.mark.parametrize("own", [0.0, -2.0])
-def test_frames_that_do_not_agree_with_themselves_are_one_look(own: float) -> None:
+def test_frames_that_do_not_agree_with_themselves_are_one_observation(own: float) -> None:
     assert effective_sample_size(agreement(0.3, own)) == 1.0

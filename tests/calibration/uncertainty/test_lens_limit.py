@@ -34,13 +34,13 @@ def feigned_deg(camera: Camera, fit: DoubleSphereFit) -> float:
     rays, seen = unproject(camera, uv_px)
     fitted, also = unproject(fit.camera, uv_px)
     both = seen & also
-    found = [
+    result = [
         np.linalg.norm(_turn(rays[here], fitted[here]))
         for left in range(0, 640, 160)
         for top in range(0, 480, 120)
         if (here := both & (np.abs(uv_px - [left + 80, top + 60]) < [80, 60]).all(axis=1)).sum() > 100
     ]
-    return float(np.degrees(max(found)))
+    return float(np.degrees(max(result)))
 
 
 def _turn(rays: NDArray[np.float64], fitted: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -78,9 +78,9 @@ def test_the_limit_is_that_of_the_result() -> None:
     fit = fit_double_sphere(camera)
     with pytest.raises(LensError) as refused:
         require_fit(camera, fit, 0.0)
-    told = refused.value.details["camera_fit"]
-    assert isinstance(told, dict)
-    error_deg = told["error_deg"]
+    reported = refused.value.details["camera_fit"]
+    assert isinstance(reported, dict)
+    error_deg = reported["error_deg"]
     require_fit(camera, fit, 1.001 * error_deg)
     with pytest.raises(LensError, match="leave --camera-model out"):
         require_fit(camera, fit, 0.999 * error_deg)

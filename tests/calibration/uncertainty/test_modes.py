@@ -9,7 +9,7 @@ from coec.calibration.objective.mutual_information import Cells, Evaluation
 from coec.calibration.solver import Rivals
 from coec.calibration.uncertainty.covariance import with_modes
 from coec.geometry import se3
-from support.scenes import NO_SIGHT_LINES, Array
+from support.scenes import NO_WINDOW_DATA_LINES, Array
 
 AWAY = np.array([0.0, 0.02, 0.0, 0.0, 0.0, 0.0])
 SIGMA = 1e-3
@@ -36,7 +36,7 @@ class TwoSummits:
 
     def cells(self, T_camera_lidar: Array) -> Cells:
         assert np.allclose(T_camera_lidar, np.eye(4))  # cut at the best one
-        return Cells(self._at, self.step_rad, NO_SIGHT_LINES)
+        return Cells(self._at, self.step_rad, NO_WINDOW_DATA_LINES)
 
     def _at(self, poses: Array) -> Array:
         return np.array([np.zeros((10, 5)) if np.allclose(pose, np.eye(4)) else -self._difference for pose in poses])

@@ -35,19 +35,19 @@ from support.scenes import (
 KNOWN_M = VerdictConfig().held_translation_sigma_m
 
 
-def by_name(found: tuple[RelaxedAssumption, ...]) -> dict[str, RelaxedAssumption]:
-    return {one.name: one for one in found}
+def by_name(result: tuple[RelaxedAssumption, ...]) -> dict[str, RelaxedAssumption]:
+    return {one.name: one for one in result}
 
 
 @pytest.mark.parametrize("held", [(), (3, 4, 5)])
 def test_what_is_right_is_not_contradicted(held: tuple[int, ...], rng: np.random.Generator) -> None:
     """The pose itself may be off by a little: that is no fault of what was told."""
-    points, beside = corner_points(rng), se3.perturbation(np.array([1e-3, -1e-3, 1e-3, 0.0, 0.0, 0.0]))
-    found = relax_assumptions(
-        corner_edge_levels(corner_pixels(points), points), corner_window(corner_motions()), beside, held, KNOWN_M
+    points, neighbour = corner_points(rng), se3.perturbation(np.array([1e-3, -1e-3, 1e-3, 0.0, 0.0, 0.0]))
+    result = relax_assumptions(
+        corner_edge_levels(corner_pixels(points), points), corner_window(corner_motions()), neighbour, held, KNOWN_M
     )
-    assert [one.name for one in found] == [*([HELD_FREE] if held else []), CLOCKS_FREE, LENS_FREE]
-    for one in found:
+    assert [one.name for one in result] == [*([HELD_FREE] if held else []), CLOCKS_FREE, LENS_FREE]
+    for one in result:
         assert not (one.contradicts and one.matters)
         assert np.linalg.norm(one.shift[:3]) < 2e-3
         assert np.linalg.norm(one.shift[3:]) < 0.03
@@ -57,7 +57,7 @@ def test_what_is_right_is_not_contradicted(held: tuple[int, ...], rng: np.random
 @pytest.mark.parametrize(
     "deviation", [(0.0, 0.0, 0.02), (4 / 240, -3 / 240, 0.0)], ids=["focal length", "principal point"]
 )
-def test_another_lens_is_seen_and_told(
+def test_another_lens_is_seen_and_reported(
     deviation: tuple[float, float, float],
     rng: np.random.Generator,
     record_property: Callable[[str, object], None],
@@ -73,17 +73,17 @@ def test_another_lens_is_seen_and_told(
     )
     turned = se3.perturbation(np.array([-deviation[1], deviation[0], 0.0, 0.0, 0.0, 0.0]))
     seen = corner_pixels(points, lens)
-    found = by_name(
+    result = by_name(
         relax_assumptions(corner_edge_levels(seen, points), corner_window(corner_motions()), turned, (), KNOWN_M)
     )
-    assert found[LENS_FREE].contradicts
+    assert result[LENS_FREE].contradicts
     record_property(
-        "figure", f"certainty {found[LENS_FREE].certainty:.1f}, limit {VerdictConfig().max_intrinsics_certainty}"
+        "figure", f"certainty {result[LENS_FREE].certainty:.1f}, limit {VerdictConfig().max_intrinsics_certainty}"
     )
-    assert found[LENS_FREE].certainty > VerdictConfig().max_intrinsics_certainty
-    np.testing.assert_allclose(found[LENS_FREE].deviation[LENS], deviation, atol=0.004)
-    assert np.linalg.norm(found[CLOCKS_FREE].shift[:3]) < 2e-3
-    turn = np.linalg.norm(found[LENS_FREE].shift[:3])
+    assert result[LENS_FREE].certainty > VerdictConfig().max_intrinsics_certainty
+    np.testing.assert_allclose(result[LENS_FREE].deviation[LENS], deviation, atol=0.004)
+    assert np.linalg.norm(result[CLOCKS_FREE].shift[:3]) < 2e-3
+    turn = np.linalg.norm(result[LENS_FREE].shift[:3])
     assert turn == pytest.approx(np.hypot(*deviation[:2]), abs=0.008)
 
 
@@ -91,7 +91,7 @@ def test_another_lens_is_seen_and_told(
     "clocks that are late or drift, or a shutter that rolls, by 30 to 60 ms", "the window says so, with the size"
 )
 @pytest.mark.parametrize("expected_s", [(0.03, 0.0, 0.0), (0.0, 0.06, 0.0), (0.0, 0.0, 0.04)])
-def test_clocks_that_are_off_are_seen_and_told(
+def test_clocks_that_are_off_are_seen_and_reported(
     expected_s: tuple[float, float, float], rng: np.random.Generator
 ) -> None:
     """The camera is late, later and later, or takes its rows one after the other."""
@@ -102,30 +102,30 @@ def test_clocks_that_are_off_are_seen_and_told(
         late_s = expected_s[0] + expected_s[1] * elapsed + expected_s[2] * row
         speed = np.array(motion.linear_mps) + np.cross(motion.angular_radps, at)
         passed.append(at - speed * late_s[:, None])
-    found = by_name(
+    result = by_name(
         relax_assumptions(
             corner_edge_levels(corner_pixels(passed), points), corner_window(driven), IDENTITY_POSE, (), KNOWN_M
         )
     )
-    assert found[CLOCKS_FREE].contradicts
-    np.testing.assert_allclose(found[CLOCKS_FREE].deviation[CLOCKS], expected_s, atol=0.006)
-    assert not (found[LENS_FREE].contradicts and found[LENS_FREE].matters)
+    assert result[CLOCKS_FREE].contradicts
+    np.testing.assert_allclose(result[CLOCKS_FREE].deviation[CLOCKS], expected_s, atol=0.006)
+    assert not (result[LENS_FREE].contradicts and result[LENS_FREE].matters)
 
 
 @pytest.mark.fault(
     "a camera whose centre is 6 cm from where it is held", "the window says so, with the rotation that this causes"
 )
-def test_a_centre_that_was_held_elsewhere_is_seen_and_its_turn_told(rng: np.random.Generator) -> None:
+def test_a_centre_that_was_held_elsewhere_is_seen_and_its_turn_reported(rng: np.random.Generator) -> None:
     points, truth = corner_points(rng), np.array([0.0, 0.0, 0.0, 0.05, -0.03, 0.0])
     near = [at[at[:, 2] < 8.0] for at in points]
     seen = corner_pixels([at + truth[3:] for at in near])
-    found = by_name(
+    result = by_name(
         relax_assumptions(
             corner_edge_levels(seen, near), corner_window(corner_motions()), IDENTITY_POSE, (3, 4, 5), KNOWN_M
         )
     )
-    assert found[HELD_FREE].contradicts
-    np.testing.assert_allclose(found[HELD_FREE].deviation[list(SHIFTS)], truth[3:], atol=0.01)
+    assert result[HELD_FREE].contradicts
+    np.testing.assert_allclose(result[HELD_FREE].deviation[list(SHIFTS)], truth[3:], atol=0.01)
     assert not by_name(
         relax_assumptions(
             corner_edge_levels(seen, near), corner_window(corner_motions()), se3.perturbation(truth), (3, 4, 5), KNOWN_M
@@ -133,19 +133,19 @@ def test_a_centre_that_was_held_elsewhere_is_seen_and_its_turn_told(rng: np.rand
     )[HELD_FREE].contradicts
 
 
-def test_a_standing_vehicle_tells_nothing_of_its_clocks(rng: np.random.Generator) -> None:
+def test_a_standing_vehicle_is_uninformative_of_its_clocks(rng: np.random.Generator) -> None:
     points = corner_points(rng)
-    found = relax_assumptions(
+    result = relax_assumptions(
         corner_edge_levels(corner_pixels(points), points),
         corner_window(corner_motions(speed=0.0)),
         IDENTITY_POSE,
         (),
         KNOWN_M,
     )
-    assert [one.name for one in found] == [LENS_FREE]
+    assert [one.name for one in result] == [LENS_FREE]
 
 
-def test_where_nothing_is_in_view_nothing_is_asked(rng: np.random.Generator) -> None:
+def test_where_nothing_is_in_view_nothing_is_requested(rng: np.random.Generator) -> None:
     behind = [-at for at in corner_points(rng)]
     assert (
         relax_assumptions(

@@ -16,7 +16,7 @@ KNOWN_M = 0.01
 """What a rule leaves."""
 
 
-def spread_of_told(measured_m: float, off_m: float, rng: np.random.Generator) -> tuple[float, float]:
+def spread_of_reported(measured_m: float, off_m: float, rng: np.random.Generator) -> tuple[float, float]:
     """Of centres that are known to `KNOWN_M` and measured to `measured_m`, those that a window sees `off_m` beside: how
     far they are off in truth, along the way that they were seen; and what the window is believed of it."""
     truth = rng.normal(0.0, KNOWN_M, (400_000, 3))
@@ -28,11 +28,11 @@ def spread_of_told(measured_m: float, off_m: float, rng: np.random.Generator) ->
 
 
 @pytest.mark.parametrize(("measured_m", "off_m"), [(0.003, 0.006), (0.01, 0.02), (0.02, 0.04), (0.03, 0.06)])
-def test_a_centre_that_was_told_right_counts_by_what_is_off_in_truth(
+def test_a_centre_that_was_reported_right_counts_by_what_is_off_in_truth(
     measured_m: float, off_m: float, rng: np.random.Generator
 ) -> None:
     """However far beside a window that cannot tell it puts it. That it may have been told wrong adds a little."""
-    off, believed = spread_of_told(measured_m, off_m, rng)
+    off, believed = spread_of_reported(measured_m, off_m, rng)
     assert 0.9 * off < believed < off + 0.1 * off_m
 
 
@@ -46,7 +46,7 @@ def test_a_centre_that_is_off_beyond_doubt_is_believed(record_property: Callable
     assert centre_weight(inf, 0.30, 0.0) == pytest.approx(1.0)
 
 
-def test_what_a_window_cannot_tell_of_a_centre_is_not_believed() -> None:
+def test_what_a_window_cannot_decide_of_a_centre_is_not_believed() -> None:
     """5 cm beside, two standard deviations, as chance has it in a room."""
     assert centre_weight(1.0, 0.05, KNOWN_M) < 0.3
     assert (
@@ -63,7 +63,7 @@ def test_where_nobody_knew_the_centre_what_is_measured_counts() -> None:
 
 
 @given(certainty=st.floats(-4.0, 6.0), off_m=st.floats(0.001, 0.5), known_m=st.sampled_from([0.0, 0.003, KNOWN_M, 0.1]))
-def test_no_belief_jumps(certainty: float, off_m: float, known_m: float) -> None:
+def test_no_posterior_jumps(certainty: float, off_m: float, known_m: float) -> None:
     """A hundredth of a standard deviation more or less, or of the shift, is a fiftieth of what counts, and a
     millimetre."""
     one = centre_weight(certainty, off_m, known_m)

@@ -36,7 +36,7 @@ def ridge(dent: float) -> AssumedEdges:
     return cast(AssumedEdges, level)
 
 
-def ways() -> ParameterSubset:
+def options() -> ParameterSubset:
     """The principal point, and nothing else, is set free; half a thousandth moves the edges by a pixel beyond the turn
     that answers it."""
     directions = np.zeros((SIZE, 2))
@@ -48,19 +48,19 @@ def off(end: NDArray[np.float64]) -> float:
     return float(np.linalg.norm(end[list(PRINCIPAL_POINT)] - SUMMIT))
 
 
-def test_a_dent_holds_one_climb_and_not_all_of_them() -> None:
+def test_a_dent_holds_one_ascent_and_not_all_of_them() -> None:
     dented, start = ridge(0.5), np.zeros(SIZE)
-    led, *others = ends_along(PRINCIPAL_POINT, [dented], ways(), start)
+    led, *others = ends_along(PRINCIPAL_POINT, [dented], options(), start)
     assert off(led) > 0.015
     assert len(others) == BEGINS
     assert min(off(end) for end in others) < 0.007
 
 
 def test_a_ridge_without_dents_has_one_end() -> None:
-    for end in ends_along(PRINCIPAL_POINT, [ridge(0.0)], ways(), np.zeros(SIZE)):
+    for end in ends_along(PRINCIPAL_POINT, [ridge(0.0)], options(), np.zeros(SIZE)):
         assert off(end) == pytest.approx(0.0, abs=2e-3)
 
 
-def test_what_no_pose_answers_has_one_climb() -> None:
-    (end,) = ends_along((), [ridge(0.5)], ways(), np.zeros(SIZE))
-    np.testing.assert_array_equal(end, local_ascent([ridge(0.5)], ways(), np.zeros(SIZE)))
+def test_what_no_pose_answers_has_one_ascent() -> None:
+    (end,) = ends_along((), [ridge(0.5)], options(), np.zeros(SIZE))
+    np.testing.assert_array_equal(end, local_ascent([ridge(0.5)], options(), np.zeros(SIZE)))

@@ -14,8 +14,8 @@ TOP = 6e-4
 
 
 def maxima(rng: np.random.Generator) -> Array:
-    drawn = rng.normal(0.0, [5e-3, 1e-3, 1e-3], SHAPE)
-    return np.asarray(drawn - drawn.mean(axis=(0, 1)))
+    samples = rng.normal(0.0, [5e-3, 1e-3, 1e-3], SHAPE)
+    return np.asarray(samples - samples.mean(axis=(0, 1)))
 
 
 def test_a_paraboloid_is_as_wide_as_its_top_says(rng: np.random.Generator) -> None:

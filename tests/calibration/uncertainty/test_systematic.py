@@ -26,7 +26,7 @@ from support.scenes import Array
 
 FRAMES = 4
 UP_OF_LIDAR = np.array([0.0, -1.0, 0.0])
-GRAIN = SensorResolution(
+RESOLUTION = SensorResolution(
     pixel_rad=1e-3,
     lens_px=0.05,
     column_rad=3e-3,
@@ -44,61 +44,61 @@ def street(rng: np.random.Generator, farthest_m: float = 40.0) -> PointsInView:
     return PointsInView(direction * range_m[:, None], np.ones(3000), rng.integers(0, FRAMES, 3000))
 
 
-def shifts(sight: PointsInView, dof: int, grain: SensorResolution = GRAIN) -> dict[str, Array]:
-    return systematic_shifts(sight, grain, tuple(range(dof)), UP_OF_LIDAR)
+def shifts(window_data: PointsInView, dof: int, resolution: SensorResolution = RESOLUTION) -> dict[str, Array]:
+    return systematic_shifts(window_data, resolution, tuple(range(dof)), UP_OF_LIDAR)
 
 
 def test_every_term_answers_on_the_axes_that_were_searched_and_on_no_other(rng: np.random.Generator) -> None:
     assert list(shifts(street(rng), 6)) == list(TERMS)
-    found = shifts(street(rng), 3)
-    assert list(found) == [*TERMS, *HELD.values()]
-    for shift in found.values():
+    result = shifts(street(rng), 3)
+    assert list(result) == [*TERMS, *HELD.values()]
+    for shift in result.values():
         assert np.isfinite(shift).all()
         np.testing.assert_array_equal(shift[3:], 0.0)
 
 
-def test_a_principal_point_aside_is_a_turn_of_the_camera(rng: np.random.Generator) -> None:
-    off = GRAIN.lens_px * GRAIN.pixel_rad
-    found = shifts(street(rng), 3)
-    assert found["lens_across"][1] == pytest.approx(off, rel=0.15)
-    assert found["lens_down"][0] == pytest.approx(-off, rel=0.15)
-    assert np.abs(found["lens_across"][[0, 2]]).max() < 0.1 * off
+def test_a_principal_point_offset_is_a_turn_of_the_camera(rng: np.random.Generator) -> None:
+    off = RESOLUTION.lens_px * RESOLUTION.pixel_rad
+    result = shifts(street(rng), 3)
+    assert result["lens_across"][1] == pytest.approx(off, rel=0.15)
+    assert result["lens_down"][0] == pytest.approx(-off, rel=0.15)
+    assert np.abs(result["lens_across"][[0, 2]]).max() < 0.1 * off
 
 
-def test_a_centre_that_is_held_beside_is_a_turn_by_its_angle_at_the_range_of_things(rng: np.random.Generator) -> None:
+def test_a_centre_that_is_held_next_to_is_a_turn_by_its_angle_at_the_range_of_things(rng: np.random.Generator) -> None:
     """Everything 4 m ahead: a centimetre to the side is 2.5 mrad, and forward it is none."""
-    sight = street(rng)
-    ahead = replace(sight, p_camera=4.0 * sight.p_camera / sight.p_camera[:, 2:])
-    found = shifts(ahead, 3)
-    assert abs(found["held_across"][1]) == pytest.approx(GRAIN.held_m / 4.0, rel=0.2)
-    assert abs(found["held_down"][0]) == pytest.approx(GRAIN.held_m / 4.0, rel=0.2)
-    assert np.abs(found["held_forward"]).max() < 0.1 * GRAIN.held_m / 4.0
-    only_forward = systematic_shifts(ahead, GRAIN, (0, 1, 2, 3, 4), UP_OF_LIDAR)
+    window_data = street(rng)
+    ahead = replace(window_data, p_camera=4.0 * window_data.p_camera / window_data.p_camera[:, 2:])
+    result = shifts(ahead, 3)
+    assert abs(result["held_across"][1]) == pytest.approx(RESOLUTION.held_m / 4.0, rel=0.2)
+    assert abs(result["held_down"][0]) == pytest.approx(RESOLUTION.held_m / 4.0, rel=0.2)
+    assert np.abs(result["held_forward"]).max() < 0.1 * RESOLUTION.held_m / 4.0
+    only_forward = systematic_shifts(ahead, RESOLUTION, (0, 1, 2, 3, 4), UP_OF_LIDAR)
     assert [name for name in only_forward if name not in TERMS] == ["held_forward"]
 
 
 def test_a_stamp_that_is_late_is_a_shift_along_the_way(rng: np.random.Generator) -> None:
-    found = shifts(street(rng), 6)["stamps"]
-    assert abs(found[5]) == pytest.approx(10.0 * STAMP_S, rel=1e-6)
-    np.testing.assert_allclose(found[:5], 0.0, atol=1e-9)
-    still = replace(GRAIN, velocity_mps=np.zeros((FRAMES, 3)))
+    result = shifts(street(rng), 6)["stamps"]
+    assert abs(result[5]) == pytest.approx(10.0 * STAMP_S, rel=1e-6)
+    np.testing.assert_allclose(result[:5], 0.0, atol=1e-9)
+    still = replace(RESOLUTION, velocity_mps=np.zeros((FRAMES, 3)))
     np.testing.assert_allclose(shifts(street(rng), 6, still)["stamps"], 0.0, atol=1e-12)
 
 
 def test_what_moves_near_edges_alone_is_a_shift_to_the_side(rng: np.random.Generator) -> None:
     """With six degrees of freedom far edges hold the turn, and near ones the place."""
-    found = shifts(street(rng), 6)
+    result = shifts(street(rng), 6)
     for name, size_rad in (
-        ("near_edges_across", EDGE_PX * GRAIN.pixel_rad),
-        ("columns", COLUMN_SHARE * GRAIN.column_rad),
+        ("near_edges_across", EDGE_PX * RESOLUTION.pixel_rad),
+        ("columns", COLUMN_SHARE * RESOLUTION.column_rad),
     ):
-        assert 5.0 * size_rad < abs(found[name][3]) < 40.0 * size_rad
-        assert abs(found[name][1]) < size_rad
+        assert 5.0 * size_rad < abs(result[name][3]) < 40.0 * size_rad
+        assert abs(result[name][1]) < size_rad
 
 
-def test_a_lens_that_misses_its_camera_is_told_in_proportion(rng: np.random.Generator) -> None:
-    sight = street(rng)
-    good, poor = shifts(sight, 3), shifts(sight, 3, replace(GRAIN, lens_px=10.0))
+def test_a_lens_that_misses_its_camera_is_reported_in_proportion(rng: np.random.Generator) -> None:
+    window_data = street(rng)
+    good, poor = shifts(window_data, 3), shifts(window_data, 3, replace(RESOLUTION, lens_px=10.0))
     np.testing.assert_allclose(poor["lens_across"], 200.0 * good["lens_across"], rtol=1e-9)
 
 

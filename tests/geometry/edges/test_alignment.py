@@ -158,7 +158,7 @@ def test_points_behind_the_camera_and_masked_pixels_count_for_nothing() -> None:
     assert significances(masked, np.eye(4)[None]).tolist() == [0.0]
 
 
-def test_edges_laid_at_random_have_a_significance_of_about_one_however_many_are_in_view() -> None:
+def test_edges_projected_at_random_have_a_significance_of_about_one_however_many_are_in_view() -> None:
     for count in (300, 30_000):
         z = [
             significances(frames_of(CAMERAS["double_sphere"], (count,), seed, blank=0.0), POSE[None])[0]

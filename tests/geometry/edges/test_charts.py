@@ -44,8 +44,8 @@ ANYWHERE = np.array([np.pi, 1e6])
 
 def blur_rad(camera: Camera) -> float:
     """Two pixels, as an angle about the optical axis."""
-    (axis, aside), _ = project(camera, np.array([[0.0, 0.0, 1.0], [1e-3, 0.0, 1.0]]))
-    return BLUR_SIGMA_PX * 1e-3 / float(aside[0] - axis[0])
+    (axis, offset), _ = project(camera, np.array([[0.0, 0.0, 1.0], [1e-3, 0.0, 1.0]]))
+    return BLUR_SIGMA_PX * 1e-3 / float(offset[0] - axis[0])
 
 
 def maps_of(frames: int, seed: int, blank: float) -> NDArray[np.int8]:
@@ -101,17 +101,17 @@ def test_a_cell_holds_the_strength_of_the_pixel_that_its_direction_falls_on(mode
     charts, frames, _ = both(camera, (10, 10))
     columns, rows = np.meshgrid(np.arange(charts.size[1]), np.arange(charts.size[0]))
     plane = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)
-    chosen = np.random.default_rng(1).permutation(len(plane))[:3000]
-    rays = [stereographic_ray(*((plane[k] - charts.centre) / charts.cells_per_unit)) for k in chosen]
+    selected = np.random.default_rng(1).permutation(len(plane))[:3000]
+    rays = [stereographic_ray(*((plane[k] - charts.centre) / charts.cells_per_unit)) for k in selected]
     uv_px, valid = project(camera, np.array(rays))
     seen = valid & in_image(camera, uv_px)
     assert 0.2 < seen.mean() < 1.0
     for f in (0, 1):
-        found = chart_of(charts, f).ravel()[chosen]
-        expected = np.full(len(chosen), VOID)
+        result = chart_of(charts, f).ravel()[selected]
+        expected = np.full(len(selected), VOID)
         for k in np.flatnonzero(seen):
             expected[k] = frames.maps[f, int(np.floor(uv_px[k, 1] + 0.5)), int(np.floor(uv_px[k, 0] + 0.5))]
-        assert (found == expected).all()
+        assert (result == expected).all()
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -209,7 +209,7 @@ def test_masked_pixels_count_for_nothing() -> None:
     assert charted_significances(charts, np.stack([POSE, np.eye(4)])).tolist() == [0.0, 0.0]
 
 
-def test_weights_are_kept_to_a_step() -> None:
+def test_weights_are_retained_to_a_step() -> None:
     charts, frames, _ = both(CAMERAS["pinhole"], (500,))
     assert np.abs(charts.weight / WEIGHT_STEPS - frames.weight).max() <= 0.5 / WEIGHT_STEPS
 
@@ -231,12 +231,12 @@ def threads() -> Iterator[tuple[int, ...]]:
 
 def test_the_number_of_threads_does_not_matter_to_the_bit(threads: tuple[int, ...]) -> None:
     charts, _, _ = both(CAMERAS["mei"], (2000, 1500))
-    poses, steps, found = turned(POSE, 0.1, 40), np.array([0.01] * 3 + [0.1] * 3), []
+    poses, steps, result = turned(POSE, 0.1, 40), np.array([0.01] * 3 + [0.1] * 3), []
     for count in threads:
         numba.set_num_threads(count)
         ends, z = pattern_search(charts, poses, steps, 2, POSE, ANYWHERE)
-        found.append((charted_significances(charts, poses).tobytes(), ends.tobytes(), z.tobytes()))
-    assert found[0] == found[1]
+        result.append((charted_significances(charts, poses).tobytes(), ends.tobytes(), z.tobytes()))
+    assert result[0] == result[1]
 
 
 # --------------------------------------------------------------------------------------------------------- the climb
@@ -268,7 +268,7 @@ TURNS = np.radians([0.5, 0.5, 0.5, 0.0, 0.0, 0.0])
 ALL_AXES = np.array([0.01] * 3 + [0.1] * 3)
 
 
-def test_a_climb_returns_to_the_pose_that_the_maps_were_made_for() -> None:
+def test_a_ascent_returns_to_the_pose_that_the_maps_were_made_for() -> None:
     # Two degrees are two pixels of this camera, the width of the blur.
     ends, _ = pattern_search(aimed(), turned(POSE, np.radians(2.0), 12), TURNS, 4, np.eye(4), ANYWHERE)
     errors_deg = [np.degrees(se3.rotation_angle_rad(end @ se3.inverse(POSE))) for end in ends]
@@ -276,7 +276,7 @@ def test_a_climb_returns_to_the_pose_that_the_maps_were_made_for() -> None:
     assert max(errors_deg) < 0.5
 
 
-def test_a_climb_never_ends_below_its_start_and_says_where_it_is() -> None:
+def test_a_ascent_never_ends_below_its_start_and_reports_where_it_is() -> None:
     charts = aimed()
     starts = np.concatenate([turned(POSE, angle, 20) for angle in (0.0, 0.05, 0.2, 0.6)])
     before = starts.copy()
@@ -305,7 +305,7 @@ def test_no_further_step_of_the_last_size_leads_up() -> None:
         assert charted_significances(charts, np.stack(around)).max() <= reached
 
 
-def test_a_climb_stays_within_reach() -> None:
+def test_a_ascent_stays_within_reach() -> None:
     charts, reach = aimed(), np.array([np.radians(1.0), 0.05])
     away = se3.perturb(POSE, np.array([np.radians(2.0), 0.0, 0.0, 0.2, 0.0, 0.0]))
     ends, z = pattern_search(charts, away[None], ALL_AXES, 3, away, reach)
@@ -315,7 +315,7 @@ def test_a_climb_stays_within_reach() -> None:
     assert np.linalg.norm(moved[:3, 3]) <= reach[1] + 1e-5
 
 
-def test_a_climb_without_steps_of_translation_turns_about_the_camera_axes_only() -> None:
+def test_a_ascent_without_steps_of_translation_turns_about_the_camera_axes_only() -> None:
     starts = turned(POSE, np.radians(2.0), 12)
     ends, _ = pattern_search(aimed(), starts, TURNS, 4, np.eye(4), ANYWHERE)
     moved = np.array([end @ se3.inverse(start) for start, end in zip(starts, ends, strict=True)])
@@ -325,14 +325,14 @@ def test_a_climb_without_steps_of_translation_turns_about_the_camera_axes_only()
 
 # -------------------------------------------------------------------------------------------------------- apart
 @pytest.mark.parametrize("count", [1, 5, 200])
-def test_what_is_kept_lies_apart_and_what_is_left_out_does_not(count: int) -> None:
+def test_what_is_retained_is_spread_and_what_is_left_out_does_not(count: int) -> None:
     poses = turned(np.eye(4), 0.3, 150, seed=2)
     order = np.random.default_rng(4).permutation(150)
     limit_rad = 0.1
-    kept = select_separated(poses, order, count, 1.0 + 2.0 * np.cos(limit_rad)).tolist()
+    retained = select_separated(poses, order, count, 1.0 + 2.0 * np.cos(limit_rad)).tolist()
     expected: list[int] = []
     for index in order.tolist():
         gaps = [se3.rotation_angle_rad(poses[index] @ se3.inverse(poses[other])) for other in expected]
         if len(expected) < count and min(gaps, default=np.pi) >= limit_rad:
             expected.append(index)
-    assert kept == expected
+    assert retained == expected

@@ -202,7 +202,7 @@ def test_layout_that_is_wider_than_its_blur_leaves_no_trace_in_a_band() -> None:
     assert max(abs(tilt(band)) for band in (pyramid.sharp, *pyramid.bands)) < 0.05
 
 
-def test_a_band_peaks_on_an_edge_and_is_below_zero_beside_it() -> None:
+def test_a_band_peaks_on_an_edge_and_is_below_zero_next_to_it() -> None:
     grey = np.full((HEIGHT, WIDTH), 90, np.uint8)
     grey[:, 40:] = 170
     (band,) = edge_pyramid(grey, ALL, 0, 0).bands
@@ -234,9 +234,9 @@ def stripes(width: int, period_px: int = 10, step: int = 100) -> NDArray[np.uint
 
 def test_opposite_borders_of_a_picture_are_not_neighbours() -> None:
     """A mask at the bottom leaves the top as it is, next to the border of the picture or not."""
-    touching, apart = ALL.copy(), ALL.copy()
-    touching[-8:], apart[-12:-4] = False, False
-    a, b = (edge_pyramid(stripes(WIDTH), lit, 0, 0).whole for lit in (touching, apart))
+    touching, separation = ALL.copy(), ALL.copy()
+    touching[-8:], separation[-12:-4] = False, False
+    a, b = (edge_pyramid(stripes(WIDTH), lit, 0, 0).whole for lit in (touching, separation))
     # All rows above look the same but the first, which has no gradient: the reach of its shadow tells where it is.
     assert shadow(a) == pytest.approx(shadow(b), rel=0.03)
 

@@ -44,11 +44,11 @@ def test_a_pole_before_a_wall_has_two_edges_per_beam_and_the_wall_none(beams: in
     xyz_m, ring = pole_before_wall(beams)
     edges = range_edges(xyz_m, ring if with_ring else None)
     assert np.bincount(ring[edges.index], minlength=beams).tolist() == [2] * beams
-    found = xyz_m[edges.index]
-    assert horizontal_m(found) == pytest.approx(POLE_M, abs=1e-3)
+    result = xyz_m[edges.index]
+    assert horizontal_m(result) == pytest.approx(POLE_M, abs=1e-3)
     # The outermost columns on the pole, left and right of it.
-    assert np.abs(found[:, 1]).min() > POLE_RADIUS_M - POLE_M * np.radians(0.2)
-    assert np.count_nonzero(found[:, 1] > 0) == beams
+    assert np.abs(result[:, 1]).min() > POLE_RADIUS_M - POLE_M * np.radians(0.2)
+    assert np.count_nonzero(result[:, 1] > 0) == beams
 
 
 @pytest.mark.parametrize("beams", [16, 64, 128])
@@ -83,21 +83,21 @@ def edges_of_beams(columns_deg: float, spill_rad: float, phase: float) -> NDArra
 
 
 @pytest.mark.parametrize("columns_deg", [0.1, 0.17, 0.2])
-def test_over_all_ways_that_beams_can_fall_an_edge_is_where_the_silhouette_is(columns_deg: float) -> None:
+def test_over_all_directions_that_beams_can_fall_an_edge_is_where_the_silhouette_is(columns_deg: float) -> None:
     """On average; a single one is off by half a spacing at most. The last beam on the pole lies inside by that much."""
-    outside = [
+    context = [
         np.abs(edges_of_beams(columns_deg, SPILL_RAD, phase)) - 0.1 for phase in np.linspace(0.0, 1.0, 40, False)
     ]
-    assert {len(found) for found in outside} == {2}
-    assert np.degrees(np.mean(outside)) == pytest.approx(0.0, abs=0.02 * columns_deg)
-    assert np.degrees(np.max(np.abs(outside))) <= 0.51 * columns_deg
+    assert {len(result) for result in context} == {2}
+    assert np.degrees(np.mean(context)) == pytest.approx(0.0, abs=0.02 * columns_deg)
+    assert np.degrees(np.max(np.abs(context))) <= 0.51 * columns_deg
 
 
-def test_between_beams_that_are_far_apart_the_last_near_one_is_the_edge() -> None:
+def test_between_beams_that_are_distant_the_last_near_one_is_the_edge() -> None:
     """Such a sensor measures a pole as far out as half a column beside it."""
     half_rad = np.radians(0.35) / 2.0
-    outside = [np.abs(edges_of_beams(0.35, half_rad, phase)) - 0.1 for phase in np.linspace(0.0, 1.0, 40, False)]
-    assert np.degrees(np.mean(outside)) == pytest.approx(0.0, abs=0.01)
+    context = [np.abs(edges_of_beams(0.35, half_rad, phase)) - 0.1 for phase in np.linspace(0.0, 1.0, 40, False)]
+    assert np.degrees(np.mean(context)) == pytest.approx(0.0, abs=0.01)
 
 
 @pytest.mark.parametrize("with_ring", [True, False])
@@ -141,8 +141,8 @@ def test_beyond_a_hole_is_no_neighbour() -> None:
     xyz_m, ring = pole_before_wall(16)
     half_width_rad = POLE_RADIUS_M / POLE_M
     azimuth = np.abs(np.arctan2(xyz_m[:, 1], xyz_m[:, 0]))
-    kept = (azimuth < half_width_rad) | (azimuth > half_width_rad + np.radians(1.5))
-    assert len(range_edges(xyz_m[kept], ring[kept]).index) == 0
+    retained = (azimuth < half_width_rad) | (azimuth > half_width_rad + np.radians(1.5))
+    assert len(range_edges(xyz_m[retained], ring[retained]).index) == 0
 
 
 def test_the_vehicle_itself_has_no_edges() -> None:
@@ -157,12 +157,12 @@ def test_an_empty_cloud_has_no_edges(ring: NDArray[np.uint16] | None) -> None:
     assert edges.weight.shape == (0,)
 
 
-@pytest.mark.parametrize("begun", [0, 170])
+@pytest.mark.parametrize("started", [0, 170])
 @pytest.mark.parametrize("step", [1, -1])
-def test_which_way_a_sensor_turns_and_where_it_begins_changes_nothing(begun: int, step: int) -> None:
+def test_which_way_a_sensor_turns_and_where_it_begins_changes_nothing(started: int, step: int) -> None:
     xyz_m, ring = pole_before_wall(16)
     per_ring = len(ring) // 16
-    turned = np.roll(np.arange(per_ring)[::step], begun)
+    turned = np.roll(np.arange(per_ring)[::step], started)
     order = (np.arange(16)[:, None] * per_ring + turned).ravel()
     known, other = range_edges(xyz_m, ring), range_edges(np.ascontiguousarray(xyz_m[order]), ring[order])
     assert sorted(order[other.index]) == sorted(known.index)

@@ -83,7 +83,7 @@ def test_a_user_without_a_home_has_the_networks_of_the_package(monkeypatch: pyte
         open_depth(DepthConfig(model="~/mine.onnx"), LIMITS)
 
 
-def test_known_network_is_found_by_name_under_its_customary_file_name(
+def test_known_network_is_detected_by_name_under_its_customary_file_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sample_data: Path
 ) -> None:
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
@@ -113,7 +113,7 @@ def test_an_unknown_network_is_refused_with_those_that_are_there(
         open_depth(DepthConfig(model=model), LIMITS)
 
 
-def test_a_known_network_without_its_file_says_where_it_was_looked_for(
+def test_a_known_network_without_its_file_reports_where_it_was_searched(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
@@ -123,7 +123,7 @@ def test_a_known_network_without_its_file_says_where_it_was_looked_for(
         open_depth(DepthConfig(model="midas_small"), LIMITS)
 
 
-def test_cache_asks_once_per_content() -> None:
+def test_cache_requests_once_per_content() -> None:
     inner = _Counting()
     cached = CachedDepth(inner, entries=4)
     first = cached.infer(_frame(1))
@@ -135,7 +135,7 @@ def test_cache_asks_once_per_content() -> None:
     assert cached.identity == "counting"
 
 
-def test_cache_drops_what_was_not_asked_for_the_longest() -> None:
+def test_cache_drops_what_was_not_requested_the_longest() -> None:
     inner = _Counting()
     cached = CachedDepth(inner, entries=2)
     for grey in (1, 2, 1, 3):  # 3 drives out 2

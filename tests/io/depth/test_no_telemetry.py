@@ -22,5 +22,5 @@ def test_opening_a_network_leaves_no_report_to_be_sent(tmp_path: Path) -> None:
     quiet = {name: value for name, value in os.environ.items() if not name.startswith(("ORT_", "XDG_"))}
     subprocess.run([sys.executable, "-c", INFER], env={**quiet, "HOME": str(tmp_path)}, check=True, timeout=120)
     # The vendor's library keeps what it is about to send in a database below the caches of the user.
-    kept = [path for path in tmp_path.rglob("*") if path.is_file() and "coec" not in path.parts]
-    assert kept == []
+    retained = [path for path in tmp_path.rglob("*") if path.is_file() and "coec" not in path.parts]
+    assert retained == []

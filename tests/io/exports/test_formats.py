@@ -59,8 +59,8 @@ def pose(rotation: Matrix, translation: object) -> Matrix:
 def read_tf(text: str) -> Matrix:
     start = "ros2 run tf2_ros static_transform_publisher"
     line = next(line for line in text.splitlines() if line.startswith(start) and line.endswith(" cam0 &"))
-    words = shlex.split(line.removesuffix(" &"))
-    given = dict(zip(words[4::2], words[5::2], strict=True))
+    labels = shlex.split(line.removesuffix(" &"))
+    given = dict(zip(labels[4::2], labels[5::2], strict=True))
     assert (given["--frame-id"], given["--child-frame-id"]) == ("base_link", "cam0")
     q = [float(given[f"--q{name}"]) for name in "wxyz"]
     return inverse(pose(rotation_of(q), [float(given[f"--{name}"]) for name in "xyz"]))
@@ -109,9 +109,9 @@ def read_nuscenes(text: str) -> Matrix:
 def read_openlabel(text: str) -> Matrix:
     systems = json.loads(text)["openlabel"]["coordinate_systems"]
     assert systems["base_link"]["children"] == ["cam0"]
-    told = systems["cam0"]["pose_wrt_parent"]
-    x, y, z, w = told["quaternion"]
-    return inverse(pose(rotation_of([w, x, y, z]), told["translation"]))
+    reported = systems["cam0"]["pose_wrt_parent"]
+    x, y, z, w = reported["quaternion"]
+    return inverse(pose(rotation_of([w, x, y, z]), reported["translation"]))
 
 
 def read_colmap(text: str) -> Matrix:
@@ -152,9 +152,9 @@ def test_every_format_has_a_reader_here() -> None:
 @pytest.mark.parametrize("name", formats())
 @given(xi=TURNS)
 def test_what_is_read_is_what_was_written(name: str, xi: Matrix) -> None:
-    told = exported_extrinsic(xi)
+    reported = exported_extrinsic(xi)
     np.testing.assert_allclose(
-        READERS[name](formats()[name].text(told, None)), told.T_child_parent, atol=TOLERANCE, rtol=0
+        READERS[name](formats()[name].text(reported, None)), reported.T_child_parent, atol=TOLERANCE, rtol=0
     )
 
 
@@ -198,28 +198,28 @@ OTHERS = {
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_of_a_file_with_others_the_entry_alone_is_changed(name: str) -> None:
-    before, told = OTHERS[name], exported_extrinsic(np.full(6, 0.1))
-    after = formats()[name].text(told, before)
-    np.testing.assert_allclose(READERS[name](after), told.T_child_parent, atol=TOLERANCE)
+    before, reported = OTHERS[name], exported_extrinsic(np.full(6, 0.1))
+    after = formats()[name].text(reported, before)
+    np.testing.assert_allclose(READERS[name](after), reported.T_child_parent, atol=TOLERANCE)
     ours = ("cam0", "x: 9", "rostopic: /a", "rows: 1", "cols: 1", "dt: d", "data: [ 7. ]", "rows: 4", "cols: 4")
-    kept = [line for line in before.splitlines() if not any(word in line for word in ours)]
+    retained = [line for line in before.splitlines() if not any(word in line for word in ours)]
     lines = iter(after.splitlines())
-    assert all(line in lines for line in kept), after  # all of them, in their order
-    again = formats()[name].text(told, after)
+    assert all(line in lines for line in retained), after  # all of them, in their order
+    again = formats()[name].text(reported, after)
     assert again == after
 
 
 @pytest.mark.parametrize(
-    ("name", "before", "kept"),
+    ("name", "before", "retained"),
     [
         ("nuscenes", '[{"token": "t", "sensor_token": "lidar", "translation": [1, 2, 3]}]', "lidar"),
         ("openlabel", '{"openlabel": {"metadata": {"schema_version": "1.0.0"}, "frames": {"0": {}}}}', "frames"),
         ("colmap", '[{"cameras": [{"image_prefix": "a/", "ref_sensor": true}]}]', "ref_sensor"),
     ],
 )
-def test_of_a_document_in_json_the_rest_is_kept(name: str, before: str, kept: str) -> None:
+def test_of_a_document_in_json_the_rest_is_retained(name: str, before: str, retained: str) -> None:
     once = formats()[name].text(exported_extrinsic(np.zeros(6)), before)
-    assert kept in once
+    assert retained in once
     assert formats()[name].text(exported_extrinsic(np.zeros(6)), once) == once
     assert formats()[name].text(exported_extrinsic(np.full(6, 0.1)), once) != once
 
@@ -246,7 +246,7 @@ def test_a_parent_that_holds_no_entries_is_refused() -> None:
         formats()["autoware"].text(exported_extrinsic(np.zeros(6)), "base_link: 3\n")
 
 
-def test_entries_on_one_line_are_not_torn_apart() -> None:
+def test_entries_on_one_line_are_not_torn_separate() -> None:
     with pytest.raises(OutputError, match="cannot be changed alone"):
         formats()["autoware"].text(exported_extrinsic(np.zeros(6)), "base_link: {cam0: {x: 1}, cam1: {x: 2}}\n")
 

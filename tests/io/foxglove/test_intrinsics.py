@@ -23,8 +23,8 @@ def test_the_counterpart_projects_as_the_camera_does(name: str) -> None:
     camera = RATIONAL if name == "rational" else BOARD_LENSES[name]
     counterpart = viewer_camera(camera)
     assert counterpart is not None
-    told = counterpart.camera
-    K = np.array([[told.fx, 0, told.cx], [0, told.fy, told.cy], [0, 0, 1]])
+    reported = counterpart.camera
+    K = np.array([[reported.fx, 0, reported.cx], [0, reported.fy, reported.cy], [0, 0, 1]])
     D = np.array(counterpart.coefficients)
     still = np.zeros(3)
     if counterpart.distortion_model == "kannala_brandt":

@@ -46,7 +46,7 @@ Record = Callable[[str, object], None]
 HOST = "127.0.0.1"
 NOISY_BYTES = 700_000
 PICTURES_SENT = 250
-KEPT_MB = 90.0
+RETAINED_MB = 90.0
 """What may be kept for a viewer who reads nothing, of some 190 MB that were shown: 32 messages, and what the allocator
 and the kernel hold of them."""
 
@@ -66,29 +66,29 @@ def picture(lens: str = "double_sphere") -> tuple[PairPicture, Rig]:
     return picture_of(pair, rig, EXTRINSICS, PICTURE_TOPICS, LimitsConfig(), compensated=True), rig
 
 
-def shown_to(viewer: Viewer, screen: ViewerServer, picture: PairPicture, *wanted: str) -> None:
+def shown_to(viewer: Viewer, screen: ViewerServer, picture: PairPicture, *expected: str) -> None:
     """Subscribe, and show it as soon as that is known."""
-    viewer.subscribe(wanted)
-    wait_until(lambda: set(wanted) <= screen.requested_topics, f"subscriptions to {', '.join(wanted)}")
+    viewer.subscribe(expected)
+    wait_until(lambda: set(expected) <= screen.requested_topics, f"subscriptions to {', '.join(expected)}")
     screen.send_picture(picture)
 
 
 def test_pixels_arrive_as_the_projection_puts_them(screen: ViewerServer) -> None:
-    told, rig = picture()
+    reported, rig = picture()
     with Viewer(screen.url) as viewer:
-        shown_to(viewer, screen, told, *POINTS_TOPICS.values())
+        shown_to(viewer, screen, reported, *POINTS_TOPICS.values())
         for pose, T_camera_lidar in ((DisplayedPose.SERVED, BOARD_MOVED), (DisplayedPose.NOMINAL, BOARD_NOMINAL)):
             message = viewer.next_on(POINTS_TOPICS[pose])
             assert viewer.channels[POINTS_TOPICS[pose]]["schemaName"] == "foxglove.ImageAnnotations"
             assert {band.type for band in message.points} == {1}, "points, not lines"
-            assert {stamp_ns(band) for band in [message, *message.points, *message.texts]} == {told.stamp_ns}
+            assert {stamp_ns(band) for band in [message, *message.points, *message.texts]} == {reported.stamp_ns}
             # Viewers count from the corner of the first pixel, which is not where its centre is.
-            came = np.array([(point.x - 0.5, point.y - 0.5) for band in message.points for point in band.points])
-            assert places(came) == places(projected(rig.camera, T_camera_lidar, board_sweep().xyz_m[::16]))
+            received = np.array([(point.x - 0.5, point.y - 0.5) for band in message.points for point in band.points])
+            assert places(received) == places(projected(rig.camera, T_camera_lidar, board_sweep().xyz_m[::16]))
             assert [text.text for text in message.texts] == [EXTRINSICS[pose].title]
         nothing = viewer.next_on(POINTS_TOPICS[DisplayedPose.CANDIDATE])
         assert ([text.text for text in nothing.texts], len(nothing.points)) == (["none"], 0)
-        assert stamp_ns(nothing.texts[0]) == told.stamp_ns, "who synchronises waits for it"
+        assert stamp_ns(nothing.texts[0]) == reported.stamp_ns, "who synchronises waits for it"
 
 
 def stamp_ns(message: object) -> int:
@@ -97,27 +97,27 @@ def stamp_ns(message: object) -> int:
 
 
 def test_image_cloud_frames_and_intrinsics_arrive_as_they_are(screen: ViewerServer) -> None:
-    told, rig = picture("kannala_brandt")
-    assert told.image is not None
-    assert told.cloud is not None
+    reported, rig = picture("kannala_brandt")
+    assert reported.image is not None
+    assert reported.cloud is not None
     with Viewer(screen.url) as viewer:
         shown_to(
             viewer,
             screen,
-            told,
+            reported,
             viewer_scene.IMAGE_TOPIC,
             viewer_scene.CLOUD_TOPIC,
             viewer_scene.TRANSFORMS_TOPIC,
             viewer_scene.CALIBRATION_TOPIC,
         )
         image = viewer.next_on(viewer_scene.IMAGE_TOPIC)
-        assert (image.format, image.data, image.frame_id) == ("jpeg", told.image.data, "cam_served")
+        assert (image.format, image.data, image.frame_id) == ("jpeg", reported.image.data, "cam_served")
         cloud = viewer.next_on(viewer_scene.CLOUD_TOPIC)
         assert [(field.name, field.offset, field.type) for field in cloud.fields] == [
             ("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("range", 12, 7),
         ]  # fmt: skip
         assert (cloud.frame_id, cloud.point_stride) == ("velo", 16)
-        np.testing.assert_array_equal(np.frombuffer(cloud.data, "<f4").reshape(-1, 4), told.cloud)
+        np.testing.assert_array_equal(np.frombuffer(cloud.data, "<f4").reshape(-1, 4), reported.cloud)
         transforms = viewer.next_on(viewer_scene.TRANSFORMS_TOPIC).transforms
         assert [(one.parent_frame_id, one.child_frame_id) for one in transforms] == [
             ("velo", "cam_served"), ("velo", "cam_nominal"),
@@ -136,11 +136,11 @@ def test_image_cloud_frames_and_intrinsics_arrive_as_they_are(screen: ViewerServ
 
 def test_intrinsics_of_a_lens_that_viewers_do_not_know_are_those_of_one_that_they_know() -> None:
     """To a hundredth of a pixel all over the image, in OpenCV's fisheye model, which `kannala_brandt` names."""
-    told, rig = picture("double_sphere")
+    reported, rig = picture("double_sphere")
     screen = ViewerServer(HOST, 0, "coec test", rig.camera)
     try:
         with Viewer(screen.url) as viewer:
-            shown_to(viewer, screen, told, viewer_scene.CALIBRATION_TOPIC)
+            shown_to(viewer, screen, reported, viewer_scene.CALIBRATION_TOPIC)
             calibration = viewer.next_on(viewer_scene.CALIBRATION_TOPIC)
     finally:
         screen.close()
@@ -154,7 +154,7 @@ def test_intrinsics_of_a_lens_that_viewers_do_not_know_are_those_of_one_that_the
 
 def test_intrinsics_that_viewers_cannot_have_are_no_topic() -> None:
     """Who subscribed to one would wait for ever."""
-    told, rig = picture("double_sphere")
+    reported, rig = picture("double_sphere")
     odd = build(
         "mei", width=640, height=400, fx=150.0, fy=150.0, cx=320.0, cy=200.0, xi=1.0, k1=4.0, k2=-9.0, p1=0.2, p2=0.0
     )
@@ -162,7 +162,7 @@ def test_intrinsics_that_viewers_cannot_have_are_no_topic() -> None:
     screen = ViewerServer(HOST, 0, "coec test", odd)
     try:
         with Viewer(screen.url) as viewer:
-            shown_to(viewer, screen, replace(told, rig=replace(rig, camera=odd)), viewer_scene.IMAGE_TOPIC)
+            shown_to(viewer, screen, replace(reported, rig=replace(rig, camera=odd)), viewer_scene.IMAGE_TOPIC)
             viewer.next_on(viewer_scene.IMAGE_TOPIC)
             assert (
                 set(viewer.channels)
@@ -183,13 +183,13 @@ def test_the_timeline_arrives_with_its_schema_and_remarks_with_their_level(scree
         channel = viewer.channels[viewer_scene.HEALTH_TOPIC]
         assert (channel["encoding"], channel["schemaEncoding"]) == ("json", "jsonschema")
         assert json.loads(channel["schema"]) == timeline_schema()
-        remark = viewer.next_on(viewer_scene.LOG_TOPIC)
-        assert (remark.message, remark.name, remark.level) == ("It has moved.", "front", 4)
+        comment = viewer.next_on(viewer_scene.LOG_TOPIC)
+        assert (comment.message, comment.name, comment.level) == ("It has moved.", "front", 4)
         assert set(viewer.channels) == set(TOPIC_DESCRIPTIONS)
         assert viewer.info["capabilities"] == [], "viewers change nothing"
 
 
-def test_what_nobody_looks_at_is_known(screen: ViewerServer) -> None:
+def test_what_nobody_checks_is_known(screen: ViewerServer) -> None:
     assert screen.requested_topics == frozenset()
     with Viewer(screen.url) as viewer:
         viewer.subscribe([viewer_scene.IMAGE_TOPIC])
@@ -197,7 +197,7 @@ def test_what_nobody_looks_at_is_known(screen: ViewerServer) -> None:
     wait_until(lambda: screen.requested_topics == frozenset(), "its end with the viewer's")
 
 
-def test_a_port_that_is_taken_is_said_and_may_be_free_later(screen: ViewerServer) -> None:
+def test_a_port_that_is_taken_is_reported_and_may_be_free_later(screen: ViewerServer) -> None:
     port = int(screen.url.rpartition(":")[2])
     with pytest.raises(UnavailableError, match=f"{HOST}:{port}: Address already in use"):
         ViewerServer(HOST, port, "another", BOARD_LENSES["pinhole"])
@@ -216,9 +216,9 @@ def test_an_address_of_the_sixth_version_is_written_in_brackets() -> None:
     "others see everything at once; what is kept for that viewer is bounded",
 )
 def test_who_does_not_read_costs_nothing(screen: ViewerServer, record_property: Record) -> None:
-    told, _ = picture()
+    reported, _ = picture()
     noise = np.frombuffer(np.random.default_rng(1).bytes(640 * 400 * 3), np.uint8).reshape(400, 640, 3)
-    large = replace(told, image=probe(encode_png(noise), LimitsConfig()), marks={}, cloud=None)
+    large = replace(reported, image=probe(encode_png(noise), LimitsConfig()), marks={}, cloud=None)
     assert large.image is not None
     assert len(large.image.data) > NOISY_BYTES
     process = psutil.Process(os.getpid())
@@ -232,7 +232,7 @@ def test_who_does_not_read_costs_nothing(screen: ViewerServer, record_property: 
             screen.send_picture(replace(large, stamp_ns=number))
             assert stamp_ns(other.next_on(viewer_scene.IMAGE_TOPIC)) == number
         grown_mb = (process.memory_info().rss - before) / 1e6
-    assert grown_mb < KEPT_MB < PICTURES_SENT * NOISY_BYTES / 1e6
+    assert grown_mb < RETAINED_MB < PICTURES_SENT * NOISY_BYTES / 1e6
     record_property("figure", f"{grown_mb:.0f} MB of {PICTURES_SENT * len(large.image.data) / 1e6:.0f} MB shown")
 
 
@@ -248,13 +248,13 @@ NONSENSE = (
 @pytest.mark.fault("a viewer who talks nonsense", "others see everything, and nothing is changed or handed out")
 @pytest.mark.parametrize("code", [TEXT, BINARY])
 def test_nonsense_is_of_no_consequence(screen: ViewerServer, code: int) -> None:
-    told, _ = picture()
+    reported, _ = picture()
     with Viewer(screen.url) as other:
         other.subscribe([viewer_scene.IMAGE_TOPIC])
         for nonsense in NONSENSE:
             with Viewer(screen.url) as fool, suppress(OSError):
                 fool.send(nonsense, code)
         wait_until(lambda: screen.requested_topics == {viewer_scene.IMAGE_TOPIC}, "the other's subscription")
-        screen.send_picture(told)
-        assert stamp_ns(other.next_on(viewer_scene.IMAGE_TOPIC)) == told.stamp_ns
+        screen.send_picture(reported)
+        assert stamp_ns(other.next_on(viewer_scene.IMAGE_TOPIC)) == reported.stamp_ns
         assert set(other.channels) == set(TOPIC_DESCRIPTIONS)

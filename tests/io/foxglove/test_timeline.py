@@ -27,15 +27,15 @@ def fits(value: Any, node: dict[str, Any]) -> bool:
     return False
 
 
-def test_what_is_told_fits_the_schema_that_is_advertised() -> None:
-    told = FULL.document()
-    assert fits(told, timeline_schema())
-    assert set(told) == set(timeline_schema()["properties"]), "every field was tried"
-    assert not fits({**told, "state": None}, timeline_schema())
+def test_what_is_reported_fits_the_schema_that_is_advertised() -> None:
+    reported = FULL.document()
+    assert fits(reported, timeline_schema())
+    assert set(reported) == set(timeline_schema()["properties"]), "every field was tried"
+    assert not fits({**reported, "state": None}, timeline_schema())
 
 
 def test_what_is_not_known_is_left_out() -> None:
-    told = BARE.document()
-    assert fits(told, timeline_schema())
-    assert told["ages"] == {} == told["correction"]
-    assert "provenance" not in told
+    reported = BARE.document()
+    assert fits(reported, timeline_schema())
+    assert reported["ages"] == {} == reported["correction"]
+    assert "provenance" not in reported

@@ -45,8 +45,8 @@ def pixels(marks: PointMarks) -> np.ndarray:
     return np.concatenate([band.uv_corner_px for band in marks.bands]) - 0.5
 
 
-def shown(pair: FramePair, rig: Rig, wanted: frozenset[str] = PICTURE_TOPICS) -> dict[DisplayedPose, PointMarks]:
-    picture = picture_of(pair, rig, EXTRINSICS, wanted, LimitsConfig(), compensated=True)
+def shown(pair: FramePair, rig: Rig, required: frozenset[str] = PICTURE_TOPICS) -> dict[DisplayedPose, PointMarks]:
+    picture = picture_of(pair, rig, EXTRINSICS, required, LimitsConfig(), compensated=True)
     return dict(picture.marks)
 
 
@@ -62,12 +62,12 @@ def test_points_lie_where_the_camera_sees_them_at_each_extrinsic(camera: Camera)
 
 def test_many_points_are_thinned_and_silhouettes_are_not_the_ones_that_go() -> None:
     pair, rig = board_frame_pair(BOARD_LENSES["pinhole"]), board_rig(BOARD_LENSES["pinhole"])
-    drawn = pixels(shown(pair, rig)[DisplayedPose.NOMINAL])
+    rendered = pixels(shown(pair, rig)[DisplayedPose.NOMINAL])
     edges = projected(rig.camera, BOARD_NOMINAL, pair.lidar.xyz_m[silhouettes_of(pair.lidar)])
     everything = projected(rig.camera, BOARD_NOMINAL, pair.lidar.xyz_m)
-    assert len(drawn) == MAX_POINTS < len(everything)
+    assert len(rendered) == MAX_POINTS < len(everything)
     assert 30 < len(edges) < MAX_SILHOUETTES
-    assert places(edges) <= places(drawn) <= places(everything)
+    assert places(edges) <= places(rendered) <= places(everything)
 
 
 def test_silhouettes_are_the_sides_of_the_board() -> None:
@@ -85,7 +85,7 @@ def test_silhouettes_beyond_their_share_are_thinned_too() -> None:
     assert len(pixels(all_of_them)) == MAX_SILHOUETTES
 
 
-def test_the_near_is_drawn_over_the_far_and_in_another_colour() -> None:
+def test_the_near_is_rendered_over_the_far_and_in_another_colour() -> None:
     pair, rig = board_frame_pair(BOARD_LENSES["pinhole"]), board_rig(BOARD_LENSES["pinhole"])
     plain = replace(pair, lidar=LidarFrame(0, "velo", np.array([[BOARD_WALL_M, 0, 0], [BOARD_M, 1, 0]], np.float32)))
     far, near = shown(plain, rig)[DisplayedPose.NOMINAL].bands
@@ -100,7 +100,7 @@ def test_an_extrinsic_that_there_is_none_of_is_a_title() -> None:
     assert (marks.title, marks.bands) == ("none", ())
 
 
-def test_nothing_is_made_that_nobody_looks_at() -> None:
+def test_nothing_is_made_that_nobody_checks() -> None:
     pair, rig = board_frame_pair(BOARD_LENSES["pinhole"]), board_rig(BOARD_LENSES["pinhole"])
     picture = picture_of(
         pair, rig, EXTRINSICS, {viewer_scene.POINTS_TOPICS[DisplayedPose.NOMINAL]}, LimitsConfig(), compensated=True

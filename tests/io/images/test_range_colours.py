@@ -24,15 +24,15 @@ VISION = {
 
 
 @pytest.mark.parametrize("kind", VISION)
-def test_ranges_a_quarter_of_the_scale_apart_differ_for_every_eye(kind: str) -> None:
+def test_ranges_a_quarter_of_the_scale_separate_differ_for_every_eye(kind: str) -> None:
     rgb = WHOLE_SCALE.colours_bgr(WHOLE_SCALE.range_at(np.linspace(0.0, 1.0, 33)))[:, ::-1] / 255
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     seen = np.clip(linear @ VISION[kind].T, 0.0, 1.0)
     shown = np.where(seen <= 0.0031308, 12.92 * seen, 1.055 * seen ** (1 / 2.4) - 0.055)
     lab = cv2.cvtColor(shown[None].astype(np.float32), cv2.COLOR_RGB2LAB)[0]
-    apart = np.linalg.norm(lab[:, None] - lab[None], axis=2)
-    first, second = np.indices(apart.shape)
-    assert apart[np.abs(first - second) >= 8].min() > 15.0
+    separation = np.linalg.norm(lab[:, None] - lab[None], axis=2)
+    first, second = np.indices(separation.shape)
+    assert separation[np.abs(first - second) >= 8].min() > 15.0
 
 
 def test_the_ends_follow_the_ranges_at_round_steps() -> None:

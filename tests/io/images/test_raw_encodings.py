@@ -157,7 +157,7 @@ def test_a_png_of_twelve_bits_in_sixteen_is_not_black() -> None:
 
 
 @pytest.mark.parametrize("form", BYTES_PER_PIXEL)
-def test_every_raw_format_is_looked_at_in_half_and_in_full(form: ImageFormat) -> None:
+def test_every_raw_format_is_checked_in_half_and_in_full(form: ImageFormat) -> None:
     data = np.random.default_rng(1).bytes(100 * 80 * BYTES_PER_PIXEL[form])
     image = raw_image(form, 100, 80, data, LIMITS)
 
@@ -182,7 +182,7 @@ def test_raw_pixels_become_grey_jpeg_of_the_same_size(form: ImageFormat) -> None
     np.testing.assert_allclose(grey_of(small.image, LIMITS), grey_of(frame.image, LIMITS), atol=2)
 
 
-def test_what_came_compressed_stays_to_the_byte() -> None:
+def test_what_arrived_compressed_stays_to_the_byte() -> None:
     image = probe(encode_jpeg(colours()), LIMITS)
     assert CompressingReducer(LIMITS).reduced(CameraFrame(7, "camera", image, depth=image)) == CameraFrame(
         7, "camera", image

@@ -90,7 +90,7 @@ def test_reads_back_to_the_same_bits(tmp_path: Path, mask: bool, raw: bool) -> N
         assert_same_pair(got, expected)
 
 
-def test_a_mosaic_and_a_turn_are_recorded_as_they_came(tmp_path: Path) -> None:
+def test_a_mosaic_and_a_turn_are_recorded_as_they_arrived(tmp_path: Path) -> None:
     """And times of points that in another's cloud would leave their unit open."""
     mosaic = EncodedImage(ImageFormat.BAYER_GRBG16, WIDTH, HEIGHT, np.random.default_rng(8).bytes(2 * WIDTH * HEIGHT))
     whole = a_pair(0)
@@ -114,7 +114,7 @@ def test_a_sweep_without_optional_columns_comes_back_without_them(tmp_path: Path
     assert_same_pair(read_window(tmp_path / "w.mcap")[0].pairs[0], bare)
 
 
-def kept_window(path: Path, from_pair: int, points: int = 300) -> WindowWriter:
+def retained_window(path: Path, from_pair: int, points: int = 300) -> WindowWriter:
     """Pairs 2 and 3, and behind them those of an earlier window from a pair on."""
     earlier = a_window(path.with_name("front-0.mcap"), [a_pair(i, points=points) for i in range(2)])
     rig = a_rig()
@@ -139,7 +139,7 @@ def test_pairs_of_another_window_are_read_in_the_order_of_time_and_the_file_says
     tmp_path: Path, from_pair: int, pairs: list[int]
 ) -> None:
     path = tmp_path / "front-2.mcap"
-    kept_window(path, from_pair).finish()
+    retained_window(path, from_pair).finish()
     window, _ = read_window(path)
     for got, index in zip(window.pairs, pairs, strict=True):
         assert_same_pair(got, a_pair(index))
@@ -152,7 +152,7 @@ def test_pairs_of_another_window_are_read_in_the_order_of_time_and_the_file_says
 def test_a_salvaged_window_says_which_pairs_are_of_another(tmp_path: Path) -> None:
     path = tmp_path / "front-2.mcap"
     part = path.with_name(path.name + PART_SUFFIX)
-    writer = kept_window(path, 0, points=5_000)
+    writer = retained_window(path, 0, points=5_000)
     killed_here = part.read_bytes()
     writer.abandon()
     part.write_bytes(killed_here)
@@ -179,7 +179,7 @@ def thinned(index: int) -> FramePair:
 
 
 @pytest.mark.parametrize("name", ["front", "between"])
-def test_pairs_between_those_of_a_window_are_told_apart_from_them(tmp_path: Path, name: str) -> None:
+def test_pairs_between_those_of_a_window_are_distinguished_from_them(tmp_path: Path, name: str) -> None:
     recorded = with_between(tmp_path / "w.mcap", name)
     window, _ = read_window(recorded.path)
     assert len(window.pairs) == recorded.pairs == 2
@@ -188,8 +188,8 @@ def test_pairs_between_those_of_a_window_are_told_apart_from_them(tmp_path: Path
     assert len(window.between) == 3
     for got, index in zip(window.between, (1, 2, 3), strict=True):
         assert_same_pair(got, thinned(index))
-    kept = list(pairs_since(recorded.path, a_pair(1).stamp_ns))
-    assert [pair.stamp_ns for pair in kept] == [a_pair(4).stamp_ns], "the next window takes whole pairs only"
+    retained = list(pairs_since(recorded.path, a_pair(1).stamp_ns))
+    assert [pair.stamp_ns for pair in retained] == [a_pair(4).stamp_ns], "the next window takes whole pairs only"
 
 
 def test_pairs_between_stay_where_the_result_says_that_the_camera_moved(tmp_path: Path) -> None:
@@ -218,7 +218,7 @@ def test_a_salvaged_window_has_the_pairs_between(tmp_path: Path) -> None:
     assert salvaged.path.read_bytes() == whole
 
 
-def test_senders_sequence_numbers_are_not_kept(tmp_path: Path) -> None:
+def test_senders_sequence_numbers_are_not_retained(tmp_path: Path) -> None:
     pair = a_pair(0)
     numbered = replace(pair, camera=replace(pair.camera, sequence=77))
     a_window(tmp_path / "w.mcap", [numbered])
@@ -336,7 +336,7 @@ def test_every_channel_opens_in_rosbags_and_mcap_ros2(tmp_path: Path, raw: bool)
     assert names == ["rig.json", "configuration.json", "mask.png", "result.json"]
 
 
-def test_clouds_and_raw_images_are_packed_where_it_is_asked_for_and_nothing_else(tmp_path: Path) -> None:
+def test_clouds_and_raw_images_are_packed_where_it_is_requested_and_nothing_else(tmp_path: Path) -> None:
     flat = [replace(pair, lidar=replace(pair.lidar, xyz_m=np.ones((300, 3), np.float32))) for pair in (a_pair(0),)]
     plain = a_window(tmp_path / "plain.mcap", flat)
     packed = a_window(tmp_path / "packed.mcap", flat, packed=True)
@@ -511,7 +511,7 @@ def test_lengths_that_lie_are_refused(tmp_path: Path, record: bytes, complaint: 
         list(read_records(stream))
 
 
-def test_an_mcap_that_is_no_window_is_told_apart(tmp_path: Path) -> None:
+def test_an_mcap_that_is_no_window_is_distinguished(tmp_path: Path) -> None:
     path = tmp_path / "bag.mcap"
     path.write_bytes(mcap_of())
     assert not is_window(path)
@@ -584,9 +584,9 @@ def test_salvaging_a_whole_part_gives_the_bytes_that_finish_would_have(tmp_path:
     whole = recorded.path.read_bytes()
     part = tmp_path / ("w.mcap" + PART_SUFFIX)
     recorded.path.rename(part)
-    told: list[int] = []
-    salvaged = salvage(part, lambda: told.append(1))
-    assert len(told) == recorded.pairs
+    reported: list[int] = []
+    salvaged = salvage(part, lambda: reported.append(1))
+    assert len(reported) == recorded.pairs
     assert salvaged == replace(recorded, modified_ns=recorded.path.stat().st_mtime_ns)
     assert recorded.path.read_bytes() == whole
 

@@ -81,7 +81,7 @@ def numbered_cloud(stamp_ns: int) -> Any:
     return replace(message, fields=[*message.fields, number], point_step=13, row_step=52, data=data)
 
 
-def test_one_lidar_of_a_cloud_of_several_is_chosen(tmp_path: Path) -> None:
+def test_one_lidar_of_a_cloud_of_several_is_selected(tmp_path: Path) -> None:
     drive = [
         (topic, numbered_cloud(5 + number) if topic == "/points" else message)
         for number, (topic, message) in enumerate(drive_messages())
@@ -100,7 +100,7 @@ def test_a_bag_without_chunks(tmp_path: Path) -> None:
     assert len(list(open_source(str(path)).messages())) == 4 + 8 + 20
 
 
-def test_chosen_frames_form_the_pairs_that_they_form_in_the_whole(tmp_path: Path) -> None:
+def test_selected_frames_form_the_pairs_that_they_form_in_the_whole(tmp_path: Path) -> None:
     recording = open_source(str(Bag(drive_messages()).write(tmp_path / "bag.mcap")))
 
     def pairs(cameras: list[int] | None) -> list[tuple[int, int, EgoMotion | None]]:
@@ -111,8 +111,8 @@ def test_chosen_frames_form_the_pairs_that_they_form_in_the_whole(tmp_path: Path
     whole = pairs(None)
     assert len(whole) == 4
     assert pairs([1, 3]) == [whole[1], whole[3]]
-    chosen = list(recording.messages([2]))
-    assert sum(isinstance(m, LidarFrame) for m in chosen) == 1
+    selected = list(recording.messages([2]))
+    assert sum(isinstance(m, LidarFrame) for m in selected) == 1
 
 
 def test_clouds_without_a_stamp_are_read_by_the_times_of_their_points(tmp_path: Path) -> None:
@@ -133,7 +133,7 @@ def test_clouds_without_a_stamp_are_read_by_the_times_of_their_points(tmp_path: 
     assert np.abs(late_ns).max() < 1000  # neighbouring doubles are 0.2 us apart
 
 
-def test_several_topics_of_a_type_have_to_be_chosen_from(tmp_path: Path) -> None:
+def test_several_topics_of_a_type_have_to_be_selected_from(tmp_path: Path) -> None:
     path = Bag(
         [*drive_messages(), ("/rear/image", compressed_image_message(5)), ("/imu/odom", odometry_message(5, 1.0))]
     ).write(tmp_path / "b.mcap")

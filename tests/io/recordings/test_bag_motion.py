@@ -63,16 +63,16 @@ def test_a_velocity_comes_before_transforms_and_these_before_turn_rates(tmp_path
 
 def test_the_motion_in_transforms(tmp_path: Path) -> None:
     recording = opened(tmp_path, [*WITHOUT, *poses()])
-    found = motions(recording)
-    assert recording.motion_stamps_ns == tuple(m.stamp_ns for m in found)
-    assert [m.stamp_ns for m in found] == [SECOND + 10_000_000 + k * 20_000_000 for k in range(19)]
-    for motion in found:
+    result = motions(recording)
+    assert recording.motion_stamps_ns == tuple(m.stamp_ns for m in result)
+    assert [m.stamp_ns for m in result] == [SECOND + 10_000_000 + k * 20_000_000 for k in range(19)]
+    for motion in result:
         assert motion.linear_mps == pytest.approx(TWIST[3:], abs=1e-6)
         assert motion.angular_radps == pytest.approx(TWIST[:3], abs=1e-6)
-    assert 0 < len(motions(recording, [0])) <= len(found), "a chosen frame gets those near it"
+    assert 0 < len(motions(recording, [0])) <= len(result), "a chosen frame gets those near it"
 
 
-def test_any_topic_of_motion_is_taken_that_is_asked_for(tmp_path: Path) -> None:
+def test_any_topic_of_motion_is_taken_that_is_requested(tmp_path: Path) -> None:
     everything = [*drive_messages(), *poses(), *imus(), *imus("/imu2")]
     turning = motions(opened(tmp_path, everything, "?odometry=/imu2"))
     assert [m.angular_radps[2] for m in turning] == pytest.approx([0.01 * k for k in range(40)])
@@ -81,7 +81,7 @@ def test_any_topic_of_motion_is_taken_that_is_asked_for(tmp_path: Path) -> None:
         opened(tmp_path, [*WITHOUT, *imus(), *imus("/imu2")])
 
 
-def test_the_frames_of_the_vehicle_are_named_or_told(tmp_path: Path) -> None:
+def test_the_frames_of_the_vehicle_are_named_or_reported(tmp_path: Path) -> None:
     bag = [*WITHOUT, *poses("map", "ego")]
     assert len(motions(opened(tmp_path, bag, "?moving=map,ego"))) == 19
     with pytest.raises(SourceError, match=r"'base_link' moves in 'odom'.*there: base_link,wheel, map,ego"):
@@ -102,8 +102,8 @@ def test_points_are_timed_as_their_values_or_a_person_say(tmp_path: Path) -> Non
     )
     with pytest.raises(SourceError, match=r"may be s since the stamp.*\?time=time,s,stamp"):
         sweep_of("time", [0.0, 5.0])
-    said = sweep_of("time", [0.0, 5.0], "?time=time,ms").time_offset_s
-    assert said is not None
-    assert said.tolist() == pytest.approx([0.0, 0.005])
+    reported = sweep_of("time", [0.0, 5.0], "?time=time,ms").time_offset_s
+    assert reported is not None
+    assert reported.tolist() == pytest.approx([0.0, 0.005])
     with pytest.raises(UsageError, match="for example time=timestamp,s,clock"):
         sweep_of("time", [0.0, 5.0], "?time=time,hours")

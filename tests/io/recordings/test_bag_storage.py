@@ -44,7 +44,7 @@ def a_folder(
     return path
 
 
-def told(message: SensorMessage) -> tuple[object, ...]:
+def reported(message: SensorMessage) -> tuple[object, ...]:
     match message:
         case CameraFrame():
             return message.stamp_ns, message.image.data
@@ -57,12 +57,12 @@ def told(message: SensorMessage) -> tuple[object, ...]:
 @pytest.mark.parametrize("plugin", [SQLITE, MCAP])
 @pytest.mark.parametrize("mode", [NONE, FILE, MESSAGE])
 def test_every_folder_holds_the_same_recording(tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode) -> None:
-    wanted = open_source(str(Bag(drive_messages()).write(tmp_path / "drive.mcap")))
-    found = open_source(str(a_folder(tmp_path / "drive", plugin, mode)))
-    assert [told(m) for m in found.messages()] == [told(m) for m in wanted.messages()]
-    assert found.rig.camera == wanted.rig.camera
-    assert found.rig.pair == "drive"
-    np.testing.assert_array_equal(found.rig.T_camera_lidar_nominal, wanted.rig.T_camera_lidar_nominal)
+    expected = open_source(str(Bag(drive_messages()).write(tmp_path / "drive.mcap")))
+    result = open_source(str(a_folder(tmp_path / "drive", plugin, mode)))
+    assert [reported(m) for m in result.messages()] == [reported(m) for m in expected.messages()]
+    assert result.rig.camera == expected.rig.camera
+    assert result.rig.pair == "drive"
+    np.testing.assert_array_equal(result.rig.T_camera_lidar_nominal, expected.rig.T_camera_lidar_nominal)
 
 
 def test_a_file_of_a_folder_may_be_opened_alone(tmp_path: Path) -> None:
@@ -80,15 +80,15 @@ def test_a_bag_in_several_files_is_one(tmp_path: Path) -> None:
     information = {"storage_identifier": "mcap", "relative_file_paths": [f"split_{n}.mcap" for n in range(3)]}
     with (folder / "metadata.yaml").open("w") as stream:
         YAML().dump({"rosbag2_bagfile_information": information}, stream)
-    wanted = open_source(str(Bag(drive).write(tmp_path / "drive.mcap")))
-    assert [told(m) for m in open_source(str(folder)).messages()] == [told(m) for m in wanted.messages()]
+    expected = open_source(str(Bag(drive).write(tmp_path / "drive.mcap")))
+    assert [reported(m) for m in open_source(str(folder)).messages()] == [reported(m) for m in expected.messages()]
     (folder / "split_1.mcap").unlink()
     with pytest.raises(SourceError, match=r"split lacks split_1\.mcap"):
         open_source(str(folder))
 
 
 @pytest.mark.parametrize(
-    ("metadata", "said"),
+    ("metadata", "stated"),
     [
         ("", "is empty"),
         ("[1]", "is no metadata of rosbag2"),
@@ -109,9 +109,9 @@ def test_a_bag_in_several_files_is_one(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_metadata_that_cannot_be_used_is_said(tmp_path: Path, metadata: str, said: str) -> None:
+def test_metadata_that_cannot_be_used_is_reported(tmp_path: Path, metadata: str, stated: str) -> None:
     (tmp_path / "metadata.yaml").write_text(metadata)
-    with pytest.raises(SourceError, match=said):
+    with pytest.raises(SourceError, match=stated):
         open_source(str(tmp_path))
 
 
@@ -194,7 +194,7 @@ COLUMNS = "(id, topic_id, timestamp, data)"
 
 @pytest.mark.fault("a database whose schema makes messages up", "refused before it gives more than the file holds")
 @pytest.mark.parametrize(
-    ("messages", "row", "topic", "said"),
+    ("messages", "row", "topic", "stated"),
     [
         ("(id, topic_id, timestamp, data BLOB AS (zeroblob(9000000)))", "(1, 1, 0)", "'/a'", "longer than the file"),
         ("(id PRIMARY KEY, topic_id, timestamp, data) WITHOUT ROWID", "(1, 1, 0, x'00')", "'/a'", "is damaged"),
@@ -207,9 +207,9 @@ COLUMNS = "(id, topic_id, timestamp, data)"
     ids=range(7),
 )
 def test_a_schema_that_makes_messages_up_is_refused(
-    tmp_path: Path, messages: str, row: str, topic: str, said: str
+    tmp_path: Path, messages: str, row: str, topic: str, stated: str
 ) -> None:
-    with pytest.raises(SourceError, match=said):
+    with pytest.raises(SourceError, match=stated):
         open_source(str(a_database(tmp_path / "evil.db3", messages, row, topic)))
 
 
@@ -236,7 +236,7 @@ def test_a_bag_that_grows_without_end_is_refused(
 @pytest.mark.fault("a bag's metadata that names a million files, or one twice", "refused before they are opened")
 def test_metadata_with_too_many_files_is_refused(tmp_path: Path) -> None:
     head = "rosbag2_bagfile_information: {storage_identifier: mcap, relative_file_paths: "
-    for names, said in (("[a, b, x/a]", "names a file twice"), (f"[{'a,' * 10_001}]", "relative_file_paths")):
+    for names, stated in (("[a, b, x/a]", "names a file twice"), (f"[{'a,' * 10_001}]", "relative_file_paths")):
         (tmp_path / "metadata.yaml").write_text(f"{head}{names}}}")
-        with pytest.raises(SourceError, match=said):
+        with pytest.raises(SourceError, match=stated):
             open_source(str(tmp_path))

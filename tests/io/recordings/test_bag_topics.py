@@ -28,11 +28,11 @@ def all_of(path: Path) -> list[TopicMessage]:
 
 def test_messages_come_in_the_order_in_which_they_were_recorded_as_they_are(tmp_path: Path) -> None:
     drive = drive_messages()
-    told = all_of(Bag(drive).write(tmp_path / "b.mcap"))
-    assert [(m.topic, m.type_name, m.stamp_ns) for m in told] == [
+    reported = all_of(Bag(drive).write(tmp_path / "b.mcap"))
+    assert [(m.topic, m.type_name, m.stamp_ns) for m in reported] == [
         (topic, message.__msgtype__, time) for time, (topic, message) in enumerate(drive)
     ]
-    assert [m.data for m in told] == [bytes(STORE.serialize_cdr(m, m.__msgtype__)) for _, m in drive]
+    assert [m.data for m in reported] == [bytes(STORE.serialize_cdr(m, m.__msgtype__)) for _, m in drive]
 
 
 @pytest.mark.parametrize("plugin", StoragePlugin)
@@ -46,8 +46,8 @@ def test_the_same_drive_is_the_same_in_every_file(tmp_path: Path, plugin: Storag
     folder = converted(written, tmp_path / "drive", plugin, mode)
     assert all_of(folder) == all_of(written)
     on_air = [decode(m.type_name, m.data, LimitsConfig()) for m in all_of(folder) if m.type_name in FRAMES]
-    for wanted in (open_source(str(written)), open_source(str(folder)), source):
-        assert [repr(frame) for frame in wanted.messages()] == [repr(frame) for frame in on_air]
+    for expected in (open_source(str(written)), open_source(str(folder)), source):
+        assert [repr(frame) for frame in expected.messages()] == [repr(frame) for frame in on_air]
 
 
 def test_a_topic_of_two_types_is_refused(tmp_path: Path) -> None:
@@ -56,7 +56,7 @@ def test_a_topic_of_two_types_is_refused(tmp_path: Path) -> None:
         open_topics(parse_spec(str(bag)))
 
 
-@pytest.mark.parametrize(("source", "said"), [("b.mcap?camera=/a", "takes none"), ("folder", "is no bag")])
-def test_topics_are_those_of_a_bag_as_it_is(source: str, said: str) -> None:
-    with pytest.raises(UsageError, match=said):
+@pytest.mark.parametrize(("source", "stated"), [("b.mcap?camera=/a", "takes none"), ("folder", "is no bag")])
+def test_topics_are_those_of_a_bag_as_it_is(source: str, stated: str) -> None:
+    with pytest.raises(UsageError, match=stated):
         open_topics(parse_spec(source))

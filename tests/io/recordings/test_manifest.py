@@ -215,11 +215,11 @@ ECHOED = {
 
 
 @pytest.mark.parametrize("info", [CAMERA_INFO, ECHOED], ids=["camera_calibration", "ros2 topic echo"])
-@pytest.mark.parametrize("beside", [True, False], ids=["named", "within"])
-def test_a_camera_info_is_taken_as_the_camera(tmp_path: Path, info: dict[str, Any], *, beside: bool) -> None:
+@pytest.mark.parametrize("neighbour", [True, False], ids=["named", "within"])
+def test_a_camera_info_is_taken_as_the_camera(tmp_path: Path, info: dict[str, Any], *, neighbour: bool) -> None:
     with (tmp_path / "camera_info.yaml").open("w") as stream:
         YAML().dump(info, stream)
-    a_dataset(tmp_path, camera="camera_info.yaml" if beside else info)
+    a_dataset(tmp_path, camera="camera_info.yaml" if neighbour else info)
     camera = open_source(str(tmp_path)).rig.camera
     assert cameras.intrinsics_of(camera) == {**NUMBERS, **POLYNOMIAL}
     with pytest.raises(SourceError, match=r"name it as `camera: camera_info\.yaml`"):

@@ -13,7 +13,7 @@ def stamps_s(window: Window) -> tuple[list[float], list[float]]:
     return [p.stamp_ns / 1e9 for p in window.pairs], [p.stamp_ns / 1e9 for p in window.between]
 
 
-def test_what_lies_between_the_chosen_pairs_is_thinned_and_comes_along() -> None:
+def test_what_lies_between_the_selected_pairs_is_thinned_and_comes_along() -> None:
     recording = rendered_source(STREET)
     window = window_of_recording(recording, 2, lambda *_: None).window
     (first, last), none = stamps_s(window)

@@ -53,7 +53,7 @@ def test_messages_ascend_and_the_camera_comes_after_its_partners() -> None:
     assert len(kinds) == 9 + 3 + 3
 
 
-def test_chosen_frames_bring_their_partners_and_nothing_else_is_loaded() -> None:
+def test_selected_frames_bring_their_partners_and_nothing_else_is_loaded() -> None:
     loaded: list[str] = []
     messages = a_recording(loaded).messages([1])
     assert not loaded
@@ -119,9 +119,9 @@ def test_a_bag_of_ros_1_is_refused_with_the_command_that_makes_it_readable(tmp_p
     with pytest.raises(SourceError, match="is a bag of ROS 1") as caught:
         open_source(str(path))
     message = str(caught.value)
-    program, *words = shlex.split(message.split("`")[1])
+    program, *labels = shlex.split(message.split("`")[1])
     own = Path(sys.executable).with_name(program)
-    subprocess.run([str(own) if own.exists() else program, *words], check=True, capture_output=True)
+    subprocess.run([str(own) if own.exists() else program, *labels], check=True, capture_output=True)
     made = tmp_path / "my drive"
     assert message.endswith(f"then give '{made}'")
     with pytest.raises(SourceError, match="no message of type sensor_msgs"):

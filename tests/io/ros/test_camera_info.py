@@ -51,8 +51,8 @@ def packed(*, d: tuple[float, ...] = (), claimed: int | None = None, model: str 
     return packer.put("I", *of.get("binning", (0, 0)), *of.get("roi", (0, 0, 0, 0))).put("?", False).done()
 
 
-def camera(told: CameraInfoContent, *, rectified: bool = False) -> cameras.Camera:
-    return camera_of(intrinsics_of_info(told, rectified=rectified).intrinsics)
+def camera(reported: CameraInfoContent, *, rectified: bool = False) -> cameras.Camera:
+    return camera_of(intrinsics_of_info(reported, rectified=rectified).intrinsics)
 
 
 def rays() -> NDArray[np.float64]:
@@ -60,15 +60,15 @@ def rays() -> NDArray[np.float64]:
     return np.column_stack([rng.uniform(-0.5, 0.5, (200, 2)), np.ones(200)]) * rng.uniform(1.0, 30.0, (200, 1))
 
 
-def by_opencv(told: CameraInfoContent, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    matrix, zero = np.reshape(told.k, (3, 3)), np.zeros(3)
-    return np.asarray(cv2.projectPoints(points[:, None], zero, zero, matrix, np.array(told.d))[0][:, 0])
+def by_opencv(reported: CameraInfoContent, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    matrix, zero = np.reshape(reported.k, (3, 3)), np.zeros(3)
+    return np.asarray(cv2.projectPoints(points[:, None], zero, zero, matrix, np.array(reported.d))[0][:, 0])
 
 
 def test_a_message_is_read_as_it_was_packed() -> None:
-    found = decode_info(packed(d=RATIONAL, model="rational_polynomial", binning=(2, 1), roi=(1, 2, 30, 20)))
+    result = decode_info(packed(d=RATIONAL, model="rational_polynomial", binning=(2, 1), roi=(1, 2, 30, 20)))
     # regions of interest are packed as x, y, height, width
-    assert found == info(model="rational_polynomial", d=RATIONAL, binning=(2, 1), roi=(1, 2, 20, 30))
+    assert result == info(model="rational_polynomial", d=RATIONAL, binning=(2, 1), roi=(1, 2, 20, 30))
 
 
 @pytest.mark.parametrize(
@@ -86,11 +86,11 @@ def test_a_message_is_read_as_it_was_packed() -> None:
     ],
 )
 def test_polynomials_project_as_opencv_does(model: str, d: tuple[float, ...], name: str) -> None:
-    told = info(model=model, d=d)
-    assert intrinsics_of_info(told, rectified=False).intrinsics.model == name
-    uv_px, valid = project(camera(told), rays())
+    reported = info(model=model, d=d)
+    assert intrinsics_of_info(reported, rectified=False).intrinsics.model == name
+    uv_px, valid = project(camera(reported), rays())
     assert valid.all()
-    np.testing.assert_allclose(uv_px, by_opencv(told, rays()), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(uv_px, by_opencv(reported, rays()), rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -111,10 +111,10 @@ def test_other_lenses_by_their_names(model: str, d: tuple[float, ...], name: str
 
 
 def test_a_rectified_image_has_no_distortion_whatever_the_lens() -> None:
-    told = info(model="equidistant", d=(0.1, 0.2, 0.3, 0.4))
+    reported = info(model="equidistant", d=(0.1, 0.2, 0.3, 0.4))
     expected = cameras.build("pinhole", width=640, height=480, fx=480.0, fy=481.0, cx=321.0, cy=238.0)
-    assert camera(told, rectified=True) == expected
-    assert "rectified" in intrinsics_of_info(told, rectified=True).source
+    assert camera(reported, rectified=True) == expected
+    assert "rectified" in intrinsics_of_info(reported, rectified=True).source
 
 
 def test_a_region_is_cut_out_and_then_binned() -> None:
@@ -127,7 +127,7 @@ def test_a_region_is_cut_out_and_then_binned() -> None:
     np.testing.assert_allclose(project(of_part, rays())[0], expected_px, rtol=0, atol=1e-9)
 
 
-def test_a_turn_that_is_not_applied_is_said() -> None:
+def test_a_turn_that_is_not_applied_is_reported() -> None:
     turned = cv2.Rodrigues(np.radians([0.0, 1.0, 0.0]))[0].reshape(-1).tolist()
     assert "1.00 deg" in intrinsics_of_info(info(r=tuple(turned)), rectified=False).source
     assert "deg" not in intrinsics_of_info(info(), rectified=False).source
@@ -189,7 +189,7 @@ def test_hostile_messages_are_refused_with_a_cause(payload: bytes) -> None:
         ("/compressed", "/camera_info"),
     ],
 )
-def test_the_info_lies_beside_the_image(image: str, expected: str) -> None:
+def test_the_info_lies_next_to_the_image(image: str, expected: str) -> None:
     assert info_topic(image) == expected
 
 

@@ -78,11 +78,11 @@ def test_a_running_service_says_the_level_of_the_state(state: HealthState, level
 
 
 @given(state=STATES, service=SERVICES, reasons=REASONS)
-def test_ok_is_said_of_nothing_but_what_was_looked_at(
+def test_ok_is_reported_only_of_what_was_checked(
     state: HealthState, service: ServicePhase, reasons: tuple[Reason, ...]
 ) -> None:
-    told = health(state, reasons)
-    level = level_of(told, service)
+    reported = health(state, reasons)
+    level = level_of(reported, service)
     renewed = all(reason.code != SERVICE_STUCK for reason in reasons)
 
     assert (level is DiagnosticLevel.OK) == (state == "healthy" and renewed and service in ("starting", "running"))
@@ -102,7 +102,7 @@ def test_the_sentence_is_short_and_begins_with_the_state(
     assert (service in status.message) or service in ("starting", "running")
 
 
-def test_every_figure_is_told_with_its_limit() -> None:
+def test_every_figure_is_reported_with_its_limit() -> None:
     moved = Reason(code="mount_moved", text="The mount has moved.")
     status = status_of_health(health("miscalibrated", (moved,)), "running", "SN-12", {"tf": "not published: nominal"})
 
@@ -134,31 +134,31 @@ def test_without_a_serial_number_the_hardware_is_the_pair_of_the_vehicle() -> No
 
 
 @pytest.mark.parametrize("state", get_args(SensorState))
-def test_a_sensor_is_ok_only_where_it_was_looked_at_and_fits(state: SensorState) -> None:
-    told = status_of_sensor(sensor_reply("roof", "lidar", state), "shuttle-7", "running")
-    assert (told.level is DiagnosticLevel.OK) == (state == "calibrated")
-    assert (told.level is DiagnosticLevel.ERROR) == state.endswith("_moved")
-    assert told.level is SENSOR_LEVELS[state]
+def test_a_sensor_is_ok_only_where_it_was_checked_and_fits(state: SensorState) -> None:
+    reported = status_of_sensor(sensor_reply("roof", "lidar", state), "shuttle-7", "running")
+    assert (reported.level is DiagnosticLevel.OK) == (state == "calibrated")
+    assert (reported.level is DiagnosticLevel.ERROR) == state.endswith("_moved")
+    assert reported.level is SENSOR_LEVELS[state]
     assert (
         status_of_sensor(sensor_reply("roof", "lidar", state), "shuttle-7", "stopping").level is DiagnosticLevel.STALE
     )
-    assert told.hardware_id == "shuttle-7/roof"
+    assert reported.hardware_id == "shuttle-7/roof"
 
 
 def test_a_sensor_that_moved_says_by_how_much_and_in_which_pairs() -> None:
-    told = status_of_sensor(moved_lidar_sensor(), "shuttle-7", "running")
-    assert told.message == "lidar_moved: It moved by 1.00°: seen by front, left; all else fits (99.8 %)."
-    assert told.values["pairs"] == "front, left"
-    assert told.values["probability of a move"] == "0.998"
-    assert told.values["moved"].startswith("rx 0 ± 0.05 deg, ry 1 ± 0.05 deg")
-    assert told.values["moved"].endswith("tz 0 ± 0.01 m")
+    reported = status_of_sensor(moved_lidar_sensor(), "shuttle-7", "running")
+    assert reported.message == "lidar_moved: It moved by 1.00°: seen by front, left; all else fits (99.8 %)."
+    assert reported.values["pairs"] == "front, left"
+    assert reported.values["probability of a move"] == "0.998"
+    assert reported.values["moved"].startswith("rx 0 ± 0.05 deg, ry 1 ± 0.05 deg")
+    assert reported.values["moved"].endswith("tz 0 ± 0.01 m")
 
 
-def test_of_a_sensor_that_nobody_looked_at_nothing_is_made_up() -> None:
-    told = status_of_sensor(
+def test_of_a_sensor_that_nobody_checked_nothing_is_made_up() -> None:
+    reported = status_of_sensor(
         sensor_reply("roof", "lidar", "unknown", probability=None, since_ns=None), "shuttle-7", "running"
     )
-    assert {"probability of a move", "since_ns", "moved"}.isdisjoint(told.values)
+    assert {"probability of a move", "since_ns", "moved"}.isdisjoint(reported.values)
 
 
 @given(text=st.text(max_size=4000))

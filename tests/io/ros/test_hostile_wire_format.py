@@ -41,28 +41,28 @@ def mutated(text: str) -> st.SearchStrategy[str]:
 def test_a_token_is_a_publishers_with_names_that_ros_takes_or_none(middleware: str, data: st.DataObject) -> None:
     valid, read = READERS[middleware]
     assert read(valid) is not None
-    found = read(data.draw(mutated(valid)))
-    if found is not None:
-        names = found.topic + found.type_name + (found.node or "")
+    result = read(data.draw(mutated(valid)))
+    if result is not None:
+        names = result.topic + result.type_name + (result.node or "")
         assert all(char.isascii() and (char.isalnum() or char in "_/") for char in names)
-        assert len(found.topic) < wire_format.MAX_RMW_TOKEN
+        assert len(result.topic) < wire_format.MAX_RMW_TOKEN
 
 
 @given(mutated(KEY))
-def test_a_key_is_a_topics_or_said_to_be_none(key: str) -> None:
+def test_a_key_is_a_topics_or_reported_to_be_none(key: str) -> None:
     try:
-        found = TopicKey.parse(key)
+        result = TopicKey.parse(key)
     except UsageError:
         return
-    assert 0 <= found.domain <= 999
-    assert found.type_name.count("/") == 2
+    assert 0 <= result.domain <= 999
+    assert result.type_name.count("/") == 2
 
 
 @given(st.binary(max_size=80))
 @example(b"\xff" * 33)
 @example(b"")
 def test_an_attachment_is_one_or_none(attachment: bytes) -> None:
-    found = MessageAttachment.parse(attachment)
-    if found is not None:
-        assert found.packed == attachment
-        assert found.sequence >= 0
+    result = MessageAttachment.parse(attachment)
+    if result is not None:
+        assert result.packed == attachment
+        assert result.sequence >= 0

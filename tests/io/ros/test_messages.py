@@ -120,7 +120,7 @@ def test_a_truncated_jpeg_is_refused() -> None:
 # --- clouds -------------------------------------------------------------------------------------------------
 
 
-def test_fields_in_any_order_with_padding_between_and_rows_apart() -> None:
+def test_fields_in_any_order_with_padding_between_and_rows_separate() -> None:
     # Points of 24 bytes, 2 rows of 2, 56 bytes apart: z f64 at 0, x f32 at 12, ring u8 at 17, y f32 at 20.
     data = bytearray(2 * 56)
     for i in range(4):
@@ -236,7 +236,7 @@ def test_ego_motion(type_name: str, payload: bytes, frame_id: str) -> None:
     assert message_decoding.decode(type_name, payload, LIMITS) == motion
 
 
-def test_an_imu_tells_rotation_only() -> None:
+def test_an_imu_measures_rotation_only() -> None:
     assert message_decoding.decode(messages.IMU, imu(), LIMITS) == EgoMotion(
         STAMP_NS, "imu_link", None, (0.0, 0.5, 0.125)
     )
@@ -252,7 +252,7 @@ def test_a_velocity_that_is_none_is_refused(value: float) -> None:
     assert reason_of(messages.IMU, imu(angular=(0.0, value, 0.0))) == "motion_invalid"
 
 
-def test_a_message_of_motion_with_a_name_of_a_megabyte_is_not_even_looked_at() -> None:
+def test_a_message_of_motion_with_a_name_of_a_megabyte_is_not_even_checked() -> None:
     assert reason_of(messages.IMU, imu(frame_id="x" * 2**20)) == "message_too_large"
     assert reason_of(messages.ODOMETRY, odometry("x" * 2**20)) == "message_too_large"
 
@@ -289,7 +289,7 @@ def test_a_type_that_people_take_for_the_right_one_is_refused_with_what_to_do(ty
         message_decoding.decode(type_name, b"\0\1\0\0", LIMITS)
 
 
-def test_a_message_beyond_the_limit_is_not_even_looked_at() -> None:
+def test_a_message_beyond_the_limit_is_not_even_checked() -> None:
     limits = LimitsConfig(max_message_bytes=2**16)
 
     assert reason_of(messages.POINT_CLOUD, bytes(2**16 + 1), limits) == "message_too_large"
@@ -495,14 +495,14 @@ def test_several_frames_lie_in_one_message() -> None:
         message_encoding.PlacedFrame("lidar", "camera_calibrated", radar),
     ]
 
-    told = read_by_others(messages.TF, message_encoding.encode_transforms(frames, STAMP_NS)).transforms
+    reported = read_by_others(messages.TF, message_encoding.encode_transforms(frames, STAMP_NS)).transforms
 
-    assert [(one.header.frame_id, one.child_frame_id) for one in told] == [
+    assert [(one.header.frame_id, one.child_frame_id) for one in reported] == [
         ("base", "lidar"),
         ("lidar", "camera_calibrated"),
     ]
-    assert {(one.header.stamp.sec, one.header.stamp.nanosec) for one in told} == {(STAMP_S, STAMP_REST_NS)}
-    assert told[1].transform.translation.z == 0.3
+    assert {(one.header.stamp.sec, one.header.stamp.nanosec) for one in reported} == {(STAMP_S, STAMP_REST_NS)}
+    assert reported[1].transform.translation.z == 0.3
 
 
 def test_diagnostics() -> None:
@@ -522,24 +522,24 @@ def test_diagnostics() -> None:
 
 
 @pytest.mark.parametrize("model", ["pinhole", "radtan", "kannala_brandt"])
-def test_what_ros_knows_is_said_as_it_is(model: str) -> None:
+def test_what_ros_knows_is_reported_as_it_is(model: str) -> None:
     camera = CAMERAS[model][0]
     assert message_encoding.ros_camera(camera) == (camera, 0.0)
 
 
-def test_a_double_sphere_is_said_as_equidistant() -> None:
+def test_a_double_sphere_is_reported_as_equidistant() -> None:
     camera = build("double_sphere", width=640, height=480, fx=300.0, fy=310.0, cx=320.0, cy=235.0, xi=-0.2, alpha=0.59)
 
-    said, residual_px = message_encoding.ros_camera(camera)
+    stated, residual_px = message_encoding.ros_camera(camera)
 
     assert 0.0 < residual_px < 0.01
-    info = read_by_others(messages.CAMERA_INFO, message_encoding.encode_camera_info(rig(said), STAMP_NS))
+    info = read_by_others(messages.CAMERA_INFO, message_encoding.encode_camera_info(rig(stated), STAMP_NS))
     assert info.distortion_model == "equidistant"
     assert len(info.d) == 4
-    assert info.k[0] == said.fx != 300.0
+    assert info.k[0] == stated.fx != 300.0
 
 
-def test_a_lens_that_ros_has_no_word_for_is_not_said() -> None:
+def test_a_lens_that_ros_has_no_text_for_is_not_reported() -> None:
     size = {"width": 640, "height": 480, "fx": 700.0, "fy": 700.0, "cx": 320.0, "cy": 235.0}
     camera = build("mei", **size, xi=2.2, k1=0.0168, k2=1.6549, p1=0.05, p2=0.0004)
 

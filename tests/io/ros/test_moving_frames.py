@@ -44,7 +44,7 @@ def taken(*payloads: bytes, frame: MovingFrame | None = None) -> list[EgoMotion 
     return [moving.motion(payload) for payload in payloads]
 
 
-def test_two_poses_tell_the_twist_between_them() -> None:
+def test_two_poses_report_the_twist_between_them() -> None:
     first, second = taken(at(0), at(20))
 
     assert first is None
@@ -54,7 +54,7 @@ def test_two_poses_tell_the_twist_between_them() -> None:
     assert second.angular_radps == pytest.approx(TWIST[:3], abs=1e-5)
 
 
-def test_a_drive_that_brakes_in_a_bend_is_told_to_second_order() -> None:
+def test_a_drive_that_brakes_in_a_bend_is_reported_to_second_order() -> None:
     """Poses at 50 Hz, 4 m/s² and 0.5 rad/s²: the velocity at each stamp, within what half a step of change leaves."""
     moving, T, step_s = MovingFrame("/odom", "base_link"), np.eye(4), 1e-3
     worst = 0.0
@@ -80,12 +80,12 @@ def test_other_frames_make_no_motion_and_do_not_disturb() -> None:
         ("map", "odom", START, there(0)),
     )
 
-    found = taken(at(0), wheel, other, transforms(), several)
+    result = taken(at(0), wheel, other, transforms(), several)
 
-    assert [motion is not None for motion in found] == [False, False, False, False, True]
+    assert [motion is not None for motion in result] == [False, False, False, False, True]
 
 
-def test_a_message_with_two_poses_of_the_frame_tells_the_last_motion() -> None:
+def test_a_message_with_two_poses_of_the_frame_reports_the_last_motion() -> None:
     both = transforms(("odom", "base_link", START, there(0)), ("odom", "base_link", START + 20 * MS, there(20)))
 
     (motion,) = taken(both)
@@ -94,15 +94,15 @@ def test_a_message_with_two_poses_of_the_frame_tells_the_last_motion() -> None:
     assert motion.stamp_ns == START + 10 * MS
 
 
-def test_poses_nearer_than_their_own_grain_wait_for_a_longer_base() -> None:
+def test_poses_nearer_than_their_own_resolution_wait_for_a_longer_base() -> None:
     """At 1 kHz a millimetre of a pose would be a metre per second."""
-    found = taken(*(at(ms) for ms in range(21)))
+    result = taken(*(at(ms) for ms in range(21)))
 
-    assert [ms for ms, motion in enumerate(found) if motion is not None] == [10, 20]
+    assert [ms for ms, motion in enumerate(result) if motion is not None] == [10, 20]
 
 
 @pytest.mark.parametrize("later_ms", [0, -1000, 1e3 * MAX_BETWEEN_S + 1])
-def test_nothing_is_said_across_a_gap_or_a_step_back(later_ms: float) -> None:
+def test_nothing_is_reported_across_a_gap_or_a_step_back(later_ms: float) -> None:
     assert taken(at(0), at(later_ms)) == [None, None]
     assert taken(at(0), at(later_ms), at(later_ms + 50))[2] is not None, "it goes on from there"
 

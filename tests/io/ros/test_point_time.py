@@ -25,8 +25,8 @@ def cloud_timed(name: str, form: str, values: list[float], *, stamp_ns: int = ST
     return packed_cloud([*xyz, (name, form, values)], big=big, sec=sec, nsec=nsec)
 
 
-def sweep(payload: bytes, said: PointTimeConfig | None = None) -> LidarFrame:
-    frame = message_decoding.decode(messages.POINT_CLOUD, payload, LIMITS, point_time=said)
+def sweep(payload: bytes, reported: PointTimeConfig | None = None) -> LidarFrame:
+    frame = message_decoding.decode(messages.POINT_CLOUD, payload, LIMITS, point_time=reported)
     assert isinstance(frame, LidarFrame)
     return frame
 
@@ -93,7 +93,7 @@ def test_a_time_of_day_or_since_the_start_counts_from_the_stamp(unit: str, begin
         ("time", "<f4", [0.0, 0.0], "time: float32, s since the stamp; 0.0 to 0.0 ms"),
     ],
 )
-def test_what_was_recognised_is_said(name: str, form: str, values: list[float], line: str) -> None:
+def test_what_was_recognised_is_reported(name: str, form: str, values: list[float], line: str) -> None:
     assert sweep(cloud_timed(name, form, values)).timed_by == line
 
 
@@ -121,7 +121,7 @@ def test_what_may_mean_two_things_is_refused_with_the_candidates(
 
 
 @pytest.mark.parametrize(("unit", "scale"), [("s", 1.0), ("ms", 1e-3)])
-def test_what_the_configuration_says_is_taken_as_said(unit: TimeUnit, scale: float) -> None:
+def test_what_the_configuration_reports_is_taken_as_reported(unit: TimeUnit, scale: float) -> None:
     payload = cloud_timed("time", "<f4", [0.0, 5.0])
 
     frame = sweep(payload, PointTimeConfig(field="time", unit=unit))
@@ -133,8 +133,8 @@ def test_the_configuration_names_a_field_that_nobody_knows() -> None:
     payload = cloud_timed("fired_at", "<f8", [STAMP_NS * 1e-3, STAMP_NS * 1e-3 + 1e5])
 
     assert sweep(payload).time_offset_s is None
-    said = PointTimeConfig(field="fired_at", unit="us", base="clock")
-    assert offsets_s(sweep(payload, said)) == pytest.approx([0.0, 0.1], abs=1e-6)
+    reported = PointTimeConfig(field="fired_at", unit="us", base="clock")
+    assert offsets_s(sweep(payload, reported)) == pytest.approx([0.0, 0.1], abs=1e-6)
 
 
 @pytest.mark.fault("points timed by another clock than their sweep", "the sweep is refused with its reason")
@@ -202,7 +202,7 @@ BEGIN_S = STAMP_S + STAMP_REST_NS * 1e-9
 )
 @pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
 @pytest.mark.parametrize("name", ["timestamp", "t"])
-def test_without_a_stamp_the_first_point_tells_it(unit: str, name: str) -> None:
+def test_without_a_stamp_the_first_point_reports_it(unit: str, name: str) -> None:
     frame = sweep(cloud_timed(name, "<f8", ((SWEEP_S + BEGIN_S) * TICKS[unit]).tolist(), stamp_ns=0))
 
     assert frame.stamp_ns == pytest.approx(STAMP_NS, abs=1000)  # neighbouring doubles are 0.2 us apart
@@ -243,8 +243,8 @@ def test_without_a_stamp_nothing_is_guessed(form: str, values: list[float]) -> N
 
 
 def test_without_a_stamp_a_clock_that_is_named_is_believed() -> None:
-    said = PointTimeConfig(field="timestamp", unit="s", base="clock")
-    frame = sweep(cloud_timed("timestamp", "<f8", [345.0, 345.1], stamp_ns=0), said)
+    reported = PointTimeConfig(field="timestamp", unit="s", base="clock")
+    frame = sweep(cloud_timed("timestamp", "<f8", [345.0, 345.1], stamp_ns=0), reported)
 
     assert frame.stamp_ns == 345 * 10**9
     assert offsets_s(frame) == pytest.approx([0.0, 0.1])

@@ -59,14 +59,14 @@ def test_a_cloud_of_rows_is_split_too(height: int, gap: int) -> None:
 
 
 @pytest.mark.fault("a cloud of several LiDARs", "refused as `cloud_concatenated`, and its sources are listed")
-@pytest.mark.parametrize(("source", "said"), [(None, "0, 2, 7; choose one"), (5, "0, 2, 7; none has 5")])
-def test_several_sources_are_refused_unless_one_of_them_is_chosen(source: int | None, said: str) -> None:
-    with pytest.raises(DecodeError, match=f"concatenated: its lidar_id has {said}") as refused:
+@pytest.mark.parametrize(("source", "reported"), [(None, "0, 2, 7; choose one"), (5, "0, 2, 7; none has 5")])
+def test_several_sources_are_refused_unless_one_of_them_is_selected(source: int | None, reported: str) -> None:
+    with pytest.raises(DecodeError, match=f"concatenated: its lidar_id has {reported}") as refused:
         taken(a_cloud(), source)
     assert refused.value.reason == "cloud_concatenated"
 
 
-def test_a_source_that_no_field_tells_is_refused() -> None:
+def test_a_source_that_no_field_reports_is_refused() -> None:
     with pytest.raises(DecodeError, match="no field of the points names one"):
         taken(a_cloud("laser_id"), 2)
 

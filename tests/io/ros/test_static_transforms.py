@@ -45,7 +45,7 @@ def test_a_transform_is_the_pose_of_the_child_in_its_parent() -> None:
 
 
 @given(steps=st.lists(st.tuples(twists(), st.booleans()), min_size=1, max_size=6))
-def test_ways_lead_up_and_down_any_number_of_joints(steps: list[tuple[NDArray[np.float64], bool]]) -> None:
+def test_directions_lead_up_and_down_any_number_of_joints(steps: list[tuple[NDArray[np.float64], bool]]) -> None:
     expected = np.eye(4)
     joints = []
     for index, (step, upwards) in enumerate(steps):
@@ -54,12 +54,12 @@ def test_ways_lead_up_and_down_any_number_of_joints(steps: list[tuple[NDArray[np
         expected = expected @ T_here_there
         joints.append((here, there, T_here_there) if upwards else (there, here, se3.inverse(T_here_there)))
     transforms = tree(*joints)
-    found = transforms.transform("f0", f"f{len(steps)}")
+    result = transforms.transform("f0", f"f{len(steps)}")
     back = transforms.transform(f"/f{len(steps)}", "/f0")
-    assert found is not None
+    assert result is not None
     assert back is not None
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(found @ back, np.eye(4), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(result, expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(result @ back, np.eye(4), rtol=0, atol=1e-9)
 
 
 def test_frames_that_nothing_connects() -> None:
@@ -69,28 +69,28 @@ def test_frames_that_nothing_connects() -> None:
     assert transforms.frames == ("base", "camera", "lidar", "rear")
 
 
-def test_what_was_said_last_holds_and_that_it_changed_is_known() -> None:
+def test_what_was_reported_last_holds_and_that_it_changed_is_known() -> None:
     transforms = tree(("base", "lidar", np.eye(4)))
     transforms.add((StaticTransform("base", "lidar", np.eye(4)),))
     assert transforms.replaced == 0
     transforms.add((StaticTransform("base", "lidar", T),))
     assert transforms.replaced == 1
-    found = transforms.transform("base", "lidar")
-    assert found is not None
-    np.testing.assert_array_equal(found, T)
+    result = transforms.transform("base", "lidar")
+    assert result is not None
+    np.testing.assert_array_equal(result, T)
 
 
-def test_two_parents_are_told_where_they_lie_on_the_way() -> None:
+def test_two_parents_are_reported_where_they_lie_on_the_way() -> None:
     transforms = tree(("base", "lidar", T), ("roof", "lidar", T), ("base", "camera", T), ("base", "wheel", T))
     assert transforms.doubts("camera", "lidar") == ("frame 'lidar' has the parents 'base' and 'roof'",)
     assert transforms.doubts("camera", "wheel") == ()
 
 
-def test_a_loop_is_told() -> None:
+def test_a_loop_is_reported() -> None:
     transforms = tree(("a", "b", T), ("b", "c", T), ("c", "a", T), ("x", "y", T))
-    (told,) = transforms.doubts("a", "c")
-    assert told.endswith("form a loop")
-    assert all(repr(frame) in told for frame in "abc")
+    (reported,) = transforms.doubts("a", "c")
+    assert reported.endswith("form a loop")
+    assert all(repr(frame) in reported for frame in "abc")
     assert transforms.doubts("x", "y") == ()
 
 

@@ -61,6 +61,6 @@ def test_a_gid_is_the_hash_of_the_token_low_byte_first() -> None:
         (Qos(), "::,:,:,:,,", ":1:0:0,42"),
     ],
 )
-def test_quality_of_service_is_said_as_each_says_it(qos: Qos, rmw: str, bridge: str) -> None:
+def test_quality_of_service_is_reported_as_each_reports_it(qos: Qos, rmw: str, bridge: str) -> None:
     assert qos.text == rmw
     assert qos_text(qos) == bridge

@@ -23,7 +23,7 @@ HEAD = "  sl  local_address rem_address   st tx_queue rx_queue tr tm->when retrn
         (socket.AF_INET, socket.SOCK_DGRAM, "udp", "127.0.0.1"),
     ],
 )
-def test_a_socket_that_waits_is_found(family: int, kind: int, protocol: str, address: str) -> None:
+def test_a_socket_that_waits_is_detected(family: int, kind: int, protocol: str, address: str) -> None:
     with socket.socket(family, kind) as one:
         try:
             one.bind((address, 0))
@@ -32,8 +32,8 @@ def test_a_socket_that_waits_is_found(family: int, kind: int, protocol: str, add
         if kind == socket.SOCK_STREAM:
             one.listen()
         port = one.getsockname()[1]
-        found = listening_addresses("udp" if protocol == "udp" else "tcp", port)
-        assert found == {ipaddress.ip_address(address)}
+        result = listening_addresses("udp" if protocol == "udp" else "tcp", port)
+        assert result == {ipaddress.ip_address(address)}
     assert listening_addresses("udp" if protocol == "udp" else "tcp", port) == set()
 
 

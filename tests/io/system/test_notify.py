@@ -12,7 +12,7 @@ import pytest
 from coec.io.system import ServiceManagerNotifier
 
 
-def test_the_manager_is_told_by_datagrams(tmp_path: Path) -> None:
+def test_the_manager_is_reported_by_datagrams(tmp_path: Path) -> None:
     address = str(tmp_path / "notify")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(address)
@@ -21,8 +21,8 @@ def test_the_manager_is_told_by_datagrams(tmp_path: Path) -> None:
         notifier.ready()
         notifier.watchdog()
         notifier.stopping()
-        told = [manager.recv(100) for _ in range(4)]
-        assert told == [b"EXTEND_TIMEOUT_USEC=20000000", b"READY=1", b"WATCHDOG=1", b"STOPPING=1"]
+        reported = [manager.recv(100) for _ in range(4)]
+        assert reported == [b"EXTEND_TIMEOUT_USEC=20000000", b"READY=1", b"WATCHDOG=1", b"STOPPING=1"]
         notifier.reloading()
         begins, stamp = manager.recv(100).split(b"\n")
         assert begins == b"RELOADING=1"

@@ -25,11 +25,11 @@ def test_processor_time_is_that_of_the_process_with_all_its_threads() -> None:
     with subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         own_s = float(process.stdout.readline())
-        told_s = processor_time_s(process.pid)
+        reported_s = processor_time_s(process.pid)
         assert own_s >= 0.2
-        assert told_s == pytest.approx(own_s, abs=0.05)
+        assert reported_s == pytest.approx(own_s, abs=0.05)
         before_s = time.process_time()
-        assert processor_time_s(process.pid) == pytest.approx(told_s, abs=0.01), "one that waits takes none"
+        assert processor_time_s(process.pid) == pytest.approx(reported_s, abs=0.01), "one that waits takes none"
         assert time.process_time() - before_s < 0.05
         process.communicate(b"\n")
     with pytest.raises(OSError, match="Invalid argument"):

@@ -65,14 +65,14 @@ def client(endpoint: str, bus: Bus) -> Iterator[zenoh.Session]:
         yield session
 
 
-def ask(client: zenoh.Session, selector: str, payload: bytes | None = None) -> list[zenoh.Reply]:
+def query(client: zenoh.Session, selector: str, payload: bytes | None = None) -> list[zenoh.Reply]:
     return list(client.get(selector, payload=payload, timeout=DEADLINE_S))
 
 
-def ask_ok(client: zenoh.Session, selector: str) -> zenoh.Sample:
+def query_ok(client: zenoh.Session, selector: str) -> zenoh.Sample:
     """The one good reply; asks again until the queryable is known to the client."""
     for _ in range(1000):
-        replies = ask(client, selector)
+        replies = query(client, selector)
         if replies:
             break
     (reply,) = replies
@@ -80,8 +80,8 @@ def ask_ok(client: zenoh.Session, selector: str) -> zenoh.Sample:
     return reply.ok
 
 
-def ask_error(client: zenoh.Session, selector: str, payload: bytes | None = None) -> zenoh.ReplyError:
-    (reply,) = ask(client, selector, payload)
+def query_error(client: zenoh.Session, selector: str, payload: bytes | None = None) -> zenoh.ReplyError:
+    (reply,) = query(client, selector, payload)
     assert reply.err is not None
     return reply.err
 
@@ -93,13 +93,13 @@ def serve_value(bus: Bus, key: str, value: bytes) -> None:
 
 def test_a_query_is_answered_with_encoding_and_timestamp(bus: Bus, client: zenoh.Session) -> None:
     serve_value(bus, "test/value", b"\x01")
-    sample = ask_ok(client, "test/value")
+    sample = query_ok(client, "test/value")
     assert sample.payload.to_bytes() == b"\x01"
     assert str(sample.encoding) == MSGPACK
     assert sample.timestamp is not None
 
 
-def test_errors_are_replies_in_the_format_asked_for(bus: Bus, client: zenoh.Session) -> None:
+def test_errors_are_replies_in_the_format_requested(bus: Bus, client: zenoh.Session) -> None:
     def find(key: str) -> Sequence[Route]:
         if key.endswith("good"):
             return [Route(key, lambda _: Answer(b"", MSGPACK), QueryLane.AT_ONCE)]
@@ -111,22 +111,22 @@ def test_errors_are_replies_in_the_format_asked_for(bus: Bus, client: zenoh.Sess
         raise ZeroDivisionError("secret")
 
     bus.serve("test/**", find)
-    ask_ok(client, "test/good")
-    plain = ask_error(client, "test/none")
+    query_ok(client, "test/good")
+    plain = query_error(client, "test/none")
     assert str(plain.encoding) == MSGPACK
     assert msgpack.unpackb(plain.payload.to_bytes())["code"] == "not_found"
-    as_json = ask_error(client, "test/none?format=json")
+    as_json = query_error(client, "test/none?format=json")
     assert str(as_json.encoding) == JSON
     assert json.loads(as_json.payload.to_bytes())["message"] == "no such thing"
-    fault = ask_error(client, "test/fault?format=json").payload.to_bytes()
+    fault = query_error(client, "test/fault?format=json").payload.to_bytes()
     assert json.loads(fault)["code"] == "internal"
     assert b"secret" not in fault
-    too_long = ask_error(client, "test/good", bytes(100_000)).payload.to_bytes()
+    too_long = query_error(client, "test/good", bytes(100_000)).payload.to_bytes()
     assert msgpack.unpackb(too_long)["code"] == "bad_request"
 
 
 @pytest.mark.fault("more slow queries than are answered at once", "quick ones do not wait; surplus ones get an error")
-def test_quick_answers_do_not_wait_for_slow_ones_and_too_many_are_told_so(bus: Bus, client: zenoh.Session) -> None:
+def test_quick_answers_do_not_wait_for_slow_ones_and_too_many_are_reported_so(bus: Bus, client: zenoh.Session) -> None:
     entered, release = threading.Event(), threading.Event()
 
     def slow(request: Request) -> Answer:
@@ -136,7 +136,7 @@ def test_quick_answers_do_not_wait_for_slow_ones_and_too_many_are_told_so(bus: B
 
     serve_value(bus, "test/quick", b"q")
     bus.serve("test/slow", lambda key: [Route(key, slow, QueryLane.FILES)])
-    ask_ok(client, "test/quick")
+    query_ok(client, "test/quick")
     replies: queue.SimpleQueue[zenoh.Reply] = queue.SimpleQueue()
     client.get("test/slow?n=0", replies.put, timeout=DEADLINE_S)
     assert entered.wait(DEADLINE_S)
@@ -145,7 +145,7 @@ def test_quick_answers_do_not_wait_for_slow_ones_and_too_many_are_told_so(bus: B
     refused = replies.get(timeout=DEADLINE_S)
     assert refused.err is not None
     assert msgpack.unpackb(refused.err.payload.to_bytes())["code"] == "busy"
-    assert ask_ok(client, "test/quick").payload.to_bytes() == b"q"
+    assert query_ok(client, "test/quick").payload.to_bytes() == b"q"
     release.set()
     for _ in range(WAITING[QueryLane.FILES] + 1):
         assert replies.get(timeout=DEADLINE_S).ok is not None
@@ -160,8 +160,8 @@ SOON_S = 5.0
 """7.7 s were seen where the sender waited for the readers."""
 
 
-def _note(heard: queue.SimpleQueue[int], number: int, _: zenoh.Sample) -> None:
-    heard.put(number)
+def _note(received: queue.SimpleQueue[int], number: int, _: zenoh.Sample) -> None:
+    received.put(number)
 
 
 @pytest.mark.fault(
@@ -171,23 +171,23 @@ def test_subscribers_that_stopped_reading_hold_nobody_up(
     bus: Bus, client: zenoh.Session, endpoint: str, record_property: Callable[[str, object], None]
 ) -> None:
     serve_value(bus, "test/quick", b"q")
-    ask_ok(client, "test/quick")
-    heard: queue.SimpleQueue[int] = queue.SimpleQueue()
+    query_ok(client, "test/quick")
+    received: queue.SimpleQueue[int] = queue.SimpleQueue()
     with ExitStack() as opened:
         relays = [opened.enter_context(Relay(int(endpoint.rpartition(":")[2]))) for _ in range(READERS)]
         for number, relay in enumerate(relays):
             config = ZenohConfig(connect=(f"tcp/127.0.0.1:{relay.port}",))
             session = opened.enter_context(open_session(config, LimitsConfig()))
-            session.declare_subscriber("test/out", partial(_note, heard, number))
+            session.declare_subscriber("test/out", partial(_note, received, number))
         reached: set[int] = set()
 
-        def all_hear() -> bool:
+        def all_receive() -> bool:
             bus.publish("test/out", Answer(b"", MSGPACK))
             with suppress(queue.Empty):
-                reached.add(heard.get(timeout=0.05))
+                reached.add(received.get(timeout=0.05))
             return len(reached) == READERS
 
-        wait_until(all_hear, "all subscriptions are known")
+        wait_until(all_receive, "all subscriptions are known")
         for relay in relays:
             relay.stop_reading()
         answered_s = published_s = 0.0
@@ -196,7 +196,7 @@ def test_subscribers_that_stopped_reading_hold_nobody_up(
             bus.publish("test/out", Answer(LARGE, MSGPACK))
             published_s = max(published_s, time.monotonic() - began_s)
             began_s = time.monotonic()
-            assert ask_ok(client, "test/quick").payload.to_bytes() == b"q"
+            assert query_ok(client, "test/quick").payload.to_bytes() == b"q"
             answered_s = max(answered_s, time.monotonic() - began_s)
     record_property("figure", f"put {published_s * 1e3:.0f} ms, answer {answered_s * 1e3:.0f} ms at most")
     assert max(answered_s, published_s) < SOON_S
@@ -209,10 +209,10 @@ def test_queries_that_wait_at_the_end_are_finished(bus: Bus, client: zenoh.Sessi
         assert thread.join(DEADLINE_S)
     serve_value(bus, "test/quick", b"q")
     bus.serve("test/slow", lambda key: [Route(key, lambda _: Answer(b"", MSGPACK), QueryLane.FILES)])
-    ask_ok(client, "test/quick")
+    query_ok(client, "test/quick")
     replies: queue.SimpleQueue[zenoh.Reply] = queue.SimpleQueue()
     client.get("test/slow", replies.put, timeout=DEADLINE_S)
-    ask_ok(client, "test/quick")  # one link, one order: the slow query has arrived
+    query_ok(client, "test/quick")  # one link, one order: the slow query has arrived
     bus.undeclare_queryables()
     error = replies.get(timeout=DEADLINE_S).err
     assert error is not None
@@ -262,11 +262,11 @@ def test_no_router_is_no_error(endpoint: str) -> None:
 
 
 @pytest.mark.fault("a Zenoh file with `mode: peer` and no `listen`", "nobody is listened to")
-@pytest.mark.parametrize("said", ['mode: "peer",', 'mode: "client",', ""])
-def test_a_file_that_names_no_door_opens_none(endpoint: str, bus: Bus, tmp_path: Path, said: str) -> None:
+@pytest.mark.parametrize("reported", ['mode: "peer",', 'mode: "client",', ""])
+def test_a_file_that_names_no_door_opens_none(endpoint: str, bus: Bus, tmp_path: Path, reported: str) -> None:
     del bus  # a client wants a router
     file = tmp_path / "zenoh.json5"
-    file.write_text(f'{{ {said} connect: {{ endpoints: ["{endpoint}"] }} }}')
+    file.write_text(f'{{ {reported} connect: {{ endpoints: ["{endpoint}"] }} }}')
     before = listening()
     with open_session(ZenohConfig(file=file), LimitsConfig()):
         assert listening() == before
@@ -294,7 +294,7 @@ def test_the_attachment_of_a_query_is_handed_on(bus: Bus, client: zenoh.Session)
         return Answer(b"", MSGPACK)
 
     bus.serve("test/who", lambda _: [Route("test/who", answer, QueryLane.FILES)])
-    ask_ok(client, "test/who")
+    query_ok(client, "test/who")
     assert seen.get(timeout=DEADLINE_S) is None
     list(client.get("test/who", attachment=b"me", timeout=DEADLINE_S))
     assert seen.get(timeout=DEADLINE_S) == b"me"
@@ -302,18 +302,18 @@ def test_the_attachment_of_a_query_is_handed_on(bus: Bus, client: zenoh.Session)
 
 @pytest.mark.fault("a picture that takes long to draw", "no other query waits for it")
 def test_a_picture_that_takes_long_keeps_no_other_query_waiting(bus: Bus, client: zenoh.Session) -> None:
-    drawn = threading.Event()
+    rendered = threading.Event()
 
-    def draw(_: Request) -> Answer:
-        drawn.wait(DEADLINE_S)
+    def render(_: Request) -> Answer:
+        rendered.wait(DEADLINE_S)
         return Answer(b"jpeg", "image/jpeg")
 
-    bus.serve("test/overlay", lambda _: [Route("test/overlay", draw, QueryLane.DRAWING)])
+    bus.serve("test/overlay", lambda _: [Route("test/overlay", render, QueryLane.DRAWING)])
     bus.serve("test/list", lambda _: [Route("test/list", lambda _: Answer(b"list", MSGPACK), QueryLane.FILES)])
-    assert ask_ok(client, "test/list").payload.to_bytes() == b"list"
+    assert query_ok(client, "test/list").payload.to_bytes() == b"list"
     waiting = client.get("test/overlay", timeout=DEADLINE_S)
-    assert ask_ok(client, "test/list").payload.to_bytes() == b"list"
-    drawn.set()
+    assert query_ok(client, "test/list").payload.to_bytes() == b"list"
+    rendered.set()
     (reply,) = waiting
     assert reply.ok is not None
     assert reply.ok.payload.to_bytes() == b"jpeg"
@@ -332,37 +332,37 @@ def test_a_file_that_takes_long_keeps_no_command_waiting(
 
     bus.serve("test/window", lambda _: [Route("test/window", reading, QueryLane.FILES)])
     bus.serve("test/hold", lambda _: [Route("test/hold", lambda _: Answer(b"held", MSGPACK), QueryLane.COMMANDS)])
-    assert ask_ok(client, "test/hold").payload.to_bytes() == b"held"
+    assert query_ok(client, "test/hold").payload.to_bytes() == b"held"
     waiting = client.get("test/window", timeout=DEADLINE_S)
     assert entered.wait(DEADLINE_S)
     began_s = time.monotonic()
-    assert ask_ok(client, "test/hold").payload.to_bytes() == b"held"
+    assert query_ok(client, "test/hold").payload.to_bytes() == b"held"
     record_property("figure", f"{(time.monotonic() - began_s) * 1e3:.1f} ms")
     read.set()
     (reply,) = waiting
     assert reply.ok is not None
 
 
-def test_when_a_query_came_is_known_however_long_it_waited(bus: Bus, client: zenoh.Session) -> None:
-    came: list[float] = []
+def test_when_a_query_arrived_is_known_however_long_it_waited(bus: Bus, client: zenoh.Session) -> None:
+    arrived: list[float] = []
     entered, release = threading.Event(), threading.Event()
 
     def slow(request: Request) -> Answer:
-        came.append(request.received_s)
+        arrived.append(request.received_s)
         entered.set()
         assert release.wait(DEADLINE_S)
         return Answer(b"", MSGPACK)
 
     serve_value(bus, "test/quick", b"q")
     bus.serve("test/slow", lambda key: [Route(key, slow, QueryLane.FILES)])
-    ask_ok(client, "test/quick")
+    query_ok(client, "test/quick")
     replies: queue.SimpleQueue[zenoh.Reply] = queue.SimpleQueue()
     client.get("test/slow", replies.put, timeout=DEADLINE_S)
     assert entered.wait(DEADLINE_S)
     client.get("test/slow", replies.put, timeout=DEADLINE_S)
-    ask_ok(client, "test/quick")  # one link, one order: the second has arrived
+    query_ok(client, "test/quick")  # one link, one order: the second has arrived
     arrived_s = time.monotonic()
     release.set()
     for _ in range(2):
         assert replies.get(timeout=DEADLINE_S).ok is not None
-    assert came[0] <= came[1] <= arrived_s
+    assert arrived[0] <= arrived[1] <= arrived_s

@@ -11,7 +11,7 @@ KEY = "tls/vehicle:7448#connect_private_key_base64=c2VjcmV0;enable_mtls=true"
 
 
 @pytest.mark.parametrize(
-    ("text", "certificates_asked", "open_to_all"),
+    ("text", "certificates_requested", "open_to_all"),
     [
         ("tcp/127.0.0.1:7447", False, False),
         ("tcp/127.9.9.9:7447", False, False),
@@ -33,9 +33,9 @@ KEY = "tls/vehicle:7448#connect_private_key_base64=c2VjcmV0;enable_mtls=true"
         ("tls/[::]:7448?enable_mtls=true", False, True),
     ],
 )
-def test_whom_it_lets_in(text: str, certificates_asked: bool, open_to_all: bool) -> None:
+def test_whom_it_lets_in(text: str, certificates_requested: bool, open_to_all: bool) -> None:
     endpoint = Endpoint.parse(text)
-    assert endpoint.admits_anyone(certificates_required=certificates_asked) is open_to_all
+    assert endpoint.admits_anyone(certificates_required=certificates_requested) is open_to_all
 
 
 @pytest.mark.parametrize("text", ["", "localhost", "tcp/127.0.0.1", "tcp/127.0.0.1:abc", "tcp/h:65536", "foo/h:1"])
@@ -62,10 +62,10 @@ def test_what_may_be_shown(text: str, shown: str) -> None:
 
 
 def test_what_zenoh_says_of_an_endpoint_is_shown_without_its_secret() -> None:
-    said = without_secrets(f"cannot connect to {KEY}: root_ca_certificate_base64=bm9uZQ== at x.rs:1", (KEY,))
-    assert "c2VjcmV0" not in said
-    assert "bm9uZQ" not in said
-    assert "x.rs:1" in said
+    reported = without_secrets(f"cannot connect to {KEY}: root_ca_certificate_base64=bm9uZQ== at x.rs:1", (KEY,))
+    assert "c2VjcmV0" not in reported
+    assert "bm9uZQ" not in reported
+    assert "x.rs:1" in reported
     with pytest.raises(ConfigError) as refused:
         Endpoint.parse("tls/h#connect_private_key_base64=c2VjcmV0")
     assert "c2VjcmV0" not in str(refused.value)

@@ -39,16 +39,16 @@ def flooded(authority: TestAuthority, tmp_path: Path) -> Callable[[str], dict[st
         files = (router, authority.folder / "viewer.json5", authority.folder / "operator.json5")
         command = ["unshare", "--net", sys.executable, flooding.__file__, RULES, *files, kind, SECONDS]
         run = subprocess.run([str(word) for word in command], capture_output=True, text=True, timeout=120, check=True)
-        told: dict[str, list[float | None]] = json.loads(run.stdout.splitlines()[-1])
-        return told
+        reported: dict[str, list[float | None]] = json.loads(run.stdout.splitlines()[-1])
+        return reported
 
     return flood
 
 
-def waited(told: dict[str, list[float | None]]) -> str:
+def waited(reported: dict[str, list[float | None]]) -> str:
     """The longest that the operator waited; fails if he was kept out once."""
-    times = told["operator_waited_s"]
-    assert None not in times, told
+    times = reported["operator_waited_s"]
+    assert None not in times, reported
     assert len(times) > SECONDS / 2
     return f"operator in within {max(time for time in times if time is not None):.1f} s, of {len(times)} times"
 

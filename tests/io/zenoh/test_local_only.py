@@ -15,7 +15,7 @@ from coec.io.zenoh.session import Reach, settings_of
 LIMITS = LimitsConfig()
 
 
-def outside(config: ZenohConfig, *waiting: tuple[Transport, int, str]) -> str | None:
+def context(config: ZenohConfig, *waiting: tuple[Transport, int, str]) -> str | None:
     """Why others reach a session, on a computer where these wait at ports."""
 
     def addresses(protocol: Transport, port: int) -> set[IpAddress]:
@@ -38,7 +38,7 @@ def to(*endpoints: str) -> ZenohConfig:
     ],
 )
 def test_loopback_is_this_computer(config: ZenohConfig, waiting: Iterable[tuple[Transport, int, str]]) -> None:
-    assert outside(config, *waiting) is None
+    assert context(config, *waiting) is None
 
 
 @pytest.mark.parametrize(
@@ -57,11 +57,11 @@ def test_loopback_is_this_computer(config: ZenohConfig, waiting: Iterable[tuple[
     ],
 )
 def test_whatever_else_is_not(config: ZenohConfig, waiting: Iterable[tuple[Transport, int, str]], why: str) -> None:
-    assert why in str(outside(config, *waiting))
+    assert why in str(context(config, *waiting))
 
 
 @pytest.mark.parametrize(
-    ("said", "finds"),
+    ("reported", "finds"),
     [
         ('mode: "peer", scouting: { gossip: { enabled: true } }', True),
         ('mode: "router", scouting: { gossip: { enabled: true, autoconnect: ["peer"] } }', True),
@@ -72,13 +72,13 @@ def test_whatever_else_is_not(config: ZenohConfig, waiting: Iterable[tuple[Trans
         ('mode: "client", scouting: { gossip: { enabled: true } }', False),  # it has its router alone
     ],
 )
-def test_a_peer_that_gossips_may_connect_to_anybody(tmp_path: Path, said: str, finds: bool) -> None:
+def test_a_peer_that_gossips_may_connect_to_anybody(tmp_path: Path, reported: str, finds: bool) -> None:
     file = tmp_path / "zenoh.json5"
-    file.write_text(f'{{ {said}, listen: {{ endpoints: ["tcp/127.0.0.1:0"] }} }}')
-    assert outside(ZenohConfig(file=file)) == ("it connects to peers that it learns of by gossip" if finds else None)
+    file.write_text(f'{{ {reported}, listen: {{ endpoints: ["tcp/127.0.0.1:0"] }} }}')
+    assert context(ZenohConfig(file=file)) == ("it connects to peers that it learns of by gossip" if finds else None)
 
 
-def test_what_cannot_be_told_is_not_this_computers_alone() -> None:
+def test_what_cannot_be_determined_is_not_this_computers_alone() -> None:
     def untold(_: Transport, __: int) -> set[IpAddress]:
         raise FileNotFoundError
 

@@ -48,7 +48,7 @@ def end(answer: bytes | AuthenticatedCommand) -> AuthenticatedCommand:
     return answer
 
 
-def said(
+def reported(
     listener: CommandListener, credentials: Credentials, to: str = "vehicle"
 ) -> tuple[AuthenticatedCommand, CommandSender]:
     """A whole conversation."""
@@ -57,10 +57,10 @@ def said(
     return end(listener.receive("1", last)), speaker
 
 
-def test_each_knows_the_other_and_what_was_said(authority: TestAuthority, listener: CommandListener) -> None:
-    heard, speaker = said(listener, authority.credentials("operator"))
-    assert (heard.sender, heard.payload) == ("operator", TEXT)
-    assert speaker.reply(heard.seal(b"held")) == b"held"
+def test_each_knows_the_other_and_what_was_reported(authority: TestAuthority, listener: CommandListener) -> None:
+    received, speaker = reported(listener, authority.credentials("operator"))
+    assert (received.sender, received.payload) == ("operator", TEXT)
+    assert speaker.reply(received.seal(b"held")) == b"held"
 
 
 @pytest.fixture
@@ -81,7 +81,7 @@ def test_a_certificate_that_is_not_to_be_trusted_proves_nothing(
     stranger = Credentials(other.certificate, other.private_key, authority.root)
     for credentials, why in ((expired, "expired"), (servers, "purpose"), (stranger, "issuer")):
         with pytest.raises(NotProvenError, match=f"rejected: .*{why}"):
-            said(listener, credentials)
+            reported(listener, credentials)
 
 
 def test_without_a_certificate_nothing_is_proven(
@@ -98,7 +98,7 @@ def test_without_a_certificate_nothing_is_proven(
 def test_a_certificate_with_two_names_is_nobodys(authority: TestAuthority, listener: CommandListener) -> None:
     both = authority.credentials(authority.sign("operator/CN=viewer", "both", uses="extendedKeyUsage=clientAuth\n"))
     with pytest.raises(NotProvenError, match="2 common names"):
-        said(listener, both)
+        reported(listener, both)
 
 
 @pytest.mark.fault(
@@ -117,9 +117,9 @@ def test_who_is_not_the_service_learns_nothing(authority: TestAuthority, foreign
 
 
 @pytest.mark.fault("a proven command that is changed, cut or repeated on its way", "the command is not heard")
-def test_what_was_changed_cut_or_repeated_is_not_heard(authority: TestAuthority) -> None:
+def test_what_was_changed_cut_or_repeated_is_not_received(authority: TestAuthority) -> None:
     chance = random.Random(0)
-    heard = 0
+    received = 0
     for trial in range(60):
         listener = CommandListener(authority.credentials("vehicle"))
         speaker = CommandSender(authority.credentials("operator"), "vehicle")
@@ -129,11 +129,11 @@ def test_what_was_changed_cut_or_repeated_is_not_heard(authority: TestAuthority)
         else:
             last[chance.randrange(len(last))] ^= 1 << chance.randrange(8)
         try:
-            heard += end(listener.receive("1", bytes(last))).payload != TEXT
+            received += end(listener.receive("1", bytes(last))).payload != TEXT
         except NotProvenError:
             continue
-        heard += 1
-    assert heard == 0
+        received += 1
+    assert received == 0
 
 
 def test_a_conversation_that_was_recorded_cannot_be_played_again(
@@ -152,8 +152,8 @@ def test_a_conversation_that_was_recorded_cannot_be_played_again(
 
 
 def test_an_answer_that_is_not_the_services_is_not_taken(authority: TestAuthority, listener: CommandListener) -> None:
-    heard, speaker = said(listener, authority.credentials("operator"))
-    sealed = bytearray(heard.seal(b"held"))
+    received, speaker = reported(listener, authority.credentials("operator"))
+    sealed = bytearray(received.seal(b"held"))
     sealed[-1] ^= 1
     with pytest.raises(NotProvenError):
         speaker.reply(bytes(sealed))
@@ -167,7 +167,7 @@ def test_rubbish_is_no_conversation(listener: CommandListener) -> None:
                 listener.receive("1", head + chance.randbytes(size))
 
 
-def test_what_takes_too_long_is_not_heard(authority: TestAuthority) -> None:
+def test_what_takes_too_long_is_not_received(authority: TestAuthority) -> None:
     clock = Clock()
     listener = CommandListener(authority.credentials("vehicle"), clock)
     speaker = CommandSender(authority.credentials("operator"), "vehicle")
@@ -192,9 +192,9 @@ def test_conversations_that_never_end_keep_nobody_out(authority: TestAuthority) 
         flight(listener.receive(f"flood {number}", hello))
     with pytest.raises(TooManyHandshakesError):
         listener.receive("one more", hello)
-    heard = listener.receive("let in", let_in.send(answer, TEXT))
-    assert isinstance(heard, AuthenticatedCommand)
-    assert heard.payload == TEXT
+    received = listener.receive("let in", let_in.send(answer, TEXT))
+    assert isinstance(received, AuthenticatedCommand)
+    assert received.payload == TEXT
     clock.now_s = MIN_HANDSHAKE_AGE_S + 0.1
     for number in range(10):
         flight(listener.receive(f"later {number}", hello))
@@ -232,9 +232,9 @@ def test_certificates_are_renewed_while_a_conversation_is_under_way(
     last = speaker.send(flight(listener.receive("before", speaker.first_flight())), TEXT)
     renewed = listener.renewed(foreign.credentials("vehicle"))
     assert end(renewed.receive("before", last)).sender == "operator"
-    assert said(renewed, foreign.credentials("operator"))[0].sender == "operator"
+    assert reported(renewed, foreign.credentials("operator"))[0].sender == "operator"
     with pytest.raises(NotProvenError):
-        said(renewed, authority.credentials("operator"))
+        reported(renewed, authority.credentials("operator"))
     assert renewed.digest != listener.digest == CommandListener(authority.credentials("vehicle")).digest
 
 
@@ -242,11 +242,11 @@ def test_certificates_that_cannot_be_used_renew_nothing(authority: TestAuthority
     absent = Credentials(authority.folder / "absent.pem", authority.folder / "absent.pem", authority.root)
     with pytest.raises(ConfigError, match=r"absent\.pem"):
         listener.renewed(absent)
-    assert said(listener, authority.credentials("operator"))[0].sender == "operator"
+    assert reported(listener, authority.credentials("operator"))[0].sender == "operator"
 
 
-def test_more_than_one_record_is_not_said(authority: TestAuthority, listener: CommandListener) -> None:
+def test_more_than_one_record_is_not_reported(authority: TestAuthority, listener: CommandListener) -> None:
     speaker = CommandSender(authority.credentials("operator"), "vehicle")
-    came = flight(listener.receive("1", speaker.first_flight()))
+    arrived = flight(listener.receive("1", speaker.first_flight()))
     with pytest.raises(NotProvenError, match="more than 16384 bytes"):
-        speaker.send(came, bytes(command_auth.MAX_PAYLOAD_BYTES + 1))
+        speaker.send(arrived, bytes(command_auth.MAX_PAYLOAD_BYTES + 1))

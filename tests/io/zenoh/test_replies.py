@@ -96,11 +96,11 @@ def test_the_latest_of_several_replies_with_one_key_counts() -> None:
 
 
 def test_an_error_reply_ends_the_query_and_is_bounded() -> None:
-    ended: list[bool] = []
-    replies = Replies("a/*", 1.0, lambda: ended.append(True), SMALL)
+    finished: list[bool] = []
+    replies = Replies("a/*", 1.0, lambda: finished.append(True), SMALL)
     replies.add(an_error(to_json(ErrorReply(code="busy", message="later"))))
     replies.add(a_reply("a/1", 1, may_be_copied=False))
-    assert (ended, refused(replies).reply_code) == ([True], "busy")
+    assert (finished, refused(replies).reply_code) == ([True], "busy")
     assert refused(collected(an_error(bytes(query_client.MAX_ERROR_BYTES + 1)))).reply_code == "unknown"
     assert refused(collected(an_error(query_client.TIMEOUT_PAYLOAD))).reply_code == "timeout"
     assert len(collected(an_error(query_client.TIMEOUT_PAYLOAD), a_reply("a/1", 1)).result()) == 1
@@ -154,19 +154,19 @@ def test_an_answer_larger_than_a_message_is_no_answer(router: Router) -> None:
 
 
 @pytest.mark.fault("words of the largest size, faster than they are read", "those beyond 64 MiB are counted as lost")
-def test_words_that_wait_are_bounded_in_bytes() -> None:
+def test_text_that_wait_are_bounded_in_bytes() -> None:
     nowhere = cast(Any, None)
-    words = HeartbeatReceiver(nowhere, nowhere, Keys("coec", "*"), 1.0)
-    said = SimpleNamespace(
+    text = HeartbeatReceiver(nowhere, nowhere, Keys("coec", "*"), 1.0)
+    reported = SimpleNamespace(
         kind=zenoh.SampleKind.PUT, key_expr="coec/@v1/a/last/b", payload=Payload(MAX_HEARTBEAT_BYTES)
     )
     count = MAX_WAITING_BYTES // MAX_HEARTBEAT_BYTES
     for _ in range(count + 3):
-        words._on_published(cast(zenoh.Sample, said))
-    assert words.refused() == {"too_many_at_once": 3}
-    assert sum(1 for _ in words.pending()) == count
-    words._on_published(cast(zenoh.Sample, said))
-    assert words.refused() == {}, "there is room again"
+        text._on_published(cast(zenoh.Sample, reported))
+    assert text.refused() == {"too_many_at_once": 3}
+    assert sum(1 for _ in text.pending()) == count
+    text._on_published(cast(zenoh.Sample, reported))
+    assert text.refused() == {}, "there is room again"
 
 
 def test_one_token_of_many_says_that_a_service_is_there(router: Router) -> None:

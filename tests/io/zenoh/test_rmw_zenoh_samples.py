@@ -42,11 +42,11 @@ def session() -> Iterator[zenoh.Session]:
         yield opened
 
 
-Heard = Callable[[Config], "queue.SimpleQueue[InputSample]"]
+Received = Callable[[Config], "queue.SimpleQueue[InputSample]"]
 
 
 @pytest.fixture
-def heard(session: zenoh.Session) -> Iterator[Heard]:
+def received(session: zenoh.Session) -> Iterator[Received]:
     """Whatever the service hears of the camera, put by the same session: it comes before `put` returns."""
     bus = Bus(session)
 
@@ -59,24 +59,26 @@ def heard(session: zenoh.Session) -> Iterator[Heard]:
     bus.undeclare_inputs()
 
 
-def test_the_type_comes_from_the_key_and_the_number_from_beside_the_message(
-    session: zenoh.Session, heard: Heard
+def test_the_type_comes_from_the_key_and_the_number_from_next_to_the_message(
+    session: zenoh.Session, received: Received
 ) -> None:
-    got = heard(configured("rmw_zenoh", "/front/image_raw"))
+    got = received(configured("rmw_zenoh", "/front/image_raw"))
     session.put(IMAGE, b"\0\1\0\0", attachment=ATTACHMENT)
     assert got.get(timeout=DEADLINE_S) == InputSample(b"\0\1\0\0", "application/cdr;sensor_msgs/msg/Image", ATTACHMENT)
 
 
-def test_lyricals_large_messages_come_in_and_those_for_others_do_not(session: zenoh.Session, heard: Heard) -> None:
-    got = heard(configured("rmw_zenoh", "/front/image_raw"))
+def test_lyricals_large_messages_come_in_and_those_for_others_do_not(
+    session: zenoh.Session, received: Received
+) -> None:
+    got = received(configured("rmw_zenoh", "/front/image_raw"))
     session.put(f"{IMAGE}/_buf/00112233445566778899aabbccddeeff", b"for another", attachment=ATTACHMENT)
     session.put(f"{IMAGE}/_buf_cpu", b"for all", attachment=ATTACHMENT)
     assert got.get(timeout=DEADLINE_S).payload == b"for all"
 
 
-def test_topics_below_are_other_topics(session: zenoh.Session, heard: Heard) -> None:
+def test_topics_below_are_other_topics(session: zenoh.Session, received: Received) -> None:
     raw, compressed = (
-        heard(configured("rmw_zenoh", topic)) for topic in ("/front/image_raw", "/front/image_raw/compressed")
+        received(configured("rmw_zenoh", topic)) for topic in ("/front/image_raw", "/front/image_raw/compressed")
     )
     session.put(COMPRESSED, b"jpeg", attachment=ATTACHMENT)
     session.put(IMAGE, b"raw", attachment=ATTACHMENT)
@@ -86,43 +88,47 @@ def test_topics_below_are_other_topics(session: zenoh.Session, heard: Heard) -> 
     assert compressed.empty()
 
 
-def test_another_domain_is_not_heard(session: zenoh.Session, heard: Heard) -> None:
-    got = heard(configured("rmw_zenoh", "/front/image_raw", domain=7))
+def test_another_domain_is_not_received(session: zenoh.Session, received: Received) -> None:
+    got = received(configured("rmw_zenoh", "/front/image_raw", domain=7))
     session.put(IMAGE, b"domain 0", attachment=ATTACHMENT)
     session.put("7" + IMAGE[1:], b"domain 7", attachment=ATTACHMENT)
     assert got.get(timeout=DEADLINE_S).payload == b"domain 7"
 
 
-def test_humble_has_no_hashes(session: zenoh.Session, heard: Heard) -> None:
-    got = heard(configured("rmw_zenoh", "/front/image_raw"))
+def test_humble_has_no_hashes(session: zenoh.Session, received: Received) -> None:
+    got = received(configured("rmw_zenoh", "/front/image_raw"))
     session.put("0/front/image_raw/sensor_msgs::msg::dds_::Image_/TypeHashNotSupported", b"x", attachment=ATTACHMENT)
     assert got.get(timeout=DEADLINE_S).encoding == "application/cdr;sensor_msgs/msg/Image"
 
 
 @pytest.mark.parametrize("attachment", [None, b"", ATTACHMENT + b"\0", bytes(2**20)])
-def test_an_attachment_that_is_none_is_empty(session: zenoh.Session, heard: Heard, attachment: bytes | None) -> None:
-    got = heard(configured("rmw_zenoh", "/front/image_raw"))
+def test_an_attachment_that_is_none_is_empty(
+    session: zenoh.Session, received: Received, attachment: bytes | None
+) -> None:
+    got = received(configured("rmw_zenoh", "/front/image_raw"))
     session.put(IMAGE, b"x", attachment=attachment)
     assert got.get(timeout=DEADLINE_S).attachment == b""
 
 
-def test_a_key_without_a_type_still_comes_in_to_be_counted(session: zenoh.Session, heard: Heard) -> None:
-    got = heard(configured("rmw_zenoh", "/front/image_raw"))
+def test_a_key_without_a_type_still_comes_in_to_be_counted(session: zenoh.Session, received: Received) -> None:
+    got = received(configured("rmw_zenoh", "/front/image_raw"))
     session.put("0/front/image_raw/what/ever", b"x")
     assert got.get(timeout=DEADLINE_S).encoding == "application/cdr;?"
 
 
 @pytest.mark.parametrize(("namespace", "key"), [("", "front/image_raw"), ("/shuttle", "shuttle/front/image_raw")])
-def test_a_bridge_puts_a_topic_on_its_name(session: zenoh.Session, heard: Heard, namespace: str, key: str) -> None:
-    got = heard(configured("ros2dds", "/front/image_raw", namespace=namespace))
+def test_a_bridge_puts_a_topic_on_its_name(
+    session: zenoh.Session, received: Received, namespace: str, key: str
+) -> None:
+    got = received(configured("ros2dds", "/front/image_raw", namespace=namespace))
     session.put(key, b"\0\1\0\0")
     assert got.get(timeout=DEADLINE_S) == InputSample(
         b"\0\1\0\0", "zenoh/bytes", None, origin=str(session.zid()).encode()
     )
 
 
-def test_keys_stay_keys_beside_topics(session: zenoh.Session, heard: Heard) -> None:
-    got = heard(configured("rmw_zenoh", {"key": "front/camera"}))
+def test_keys_stay_keys_next_to_topics(session: zenoh.Session, received: Received) -> None:
+    got = received(configured("rmw_zenoh", {"key": "front/camera"}))
     session.put("front/camera", b"x", encoding="application/msgpack", attachment=b"of the sender's own")
     assert got.get(timeout=DEADLINE_S) == InputSample(
         b"x", "application/msgpack", None, origin=str(session.zid()).encode()
@@ -136,6 +142,6 @@ def test_keys_are_read_and_written_alike() -> None:
 
 
 @pytest.mark.parametrize("key", ["0/a/b", "x/a/T/h", "0000/a/sensor_msgs::msg::dds_::Image_/h", "0/a/Image/h", ""])
-def test_what_is_no_key_of_a_topic_is_said(key: str) -> None:
+def test_what_is_no_key_of_a_topic_is_reported(key: str) -> None:
     with pytest.raises(UsageError):
         TopicKey.parse(key)

@@ -144,12 +144,12 @@ def test_publishers_are_seen_with_type_and_node_while_they_are_there(
 def test_a_bridges_publishers_are_seen_in_its_namespace(session: zenoh.Session, stack: ExitStack) -> None:
     token = session.liveliness().declare_token(BRIDGE)
     stack.callback(token.undeclare)
-    inside, outside = (RosSide(session, configured("ros2dds", namespace=name)) for name in ("/shuttle", "/shut"))
-    for side in (inside, outside):
+    inside, context = (RosSide(session, configured("ros2dds", namespace=name)) for name in ("/shuttle", "/shut"))
+    for side in (inside, context):
         stack.callback(side.close)
-    wait_until(lambda: bool(outside.topics().left_out), "it is seen")
+    wait_until(lambda: bool(context.topics().left_out), "it is seen")
     assert inside.topics().types() == {"/front/image_raw": ("sensor_msgs/msg/Image",)}
-    assert outside.topics().publishers == ()
+    assert context.topics().publishers == ()
 
 
 @pytest.mark.fault("liveliness tokens that no node of ROS would declare", "ignored and counted")
@@ -164,7 +164,7 @@ def test_a_bridges_publishers_are_seen_in_its_namespace(session: zenoh.Session, 
         f"@ros2_lv/0/{OTHER}/0/10/MP/x",
     ],
 )
-def test_a_token_that_tells_of_no_publisher_is_counted(session: zenoh.Session, side: RosSide, token: str) -> None:
+def test_a_token_that_reports_of_no_publisher_is_counted(session: zenoh.Session, side: RosSide, token: str) -> None:
     declared = session.liveliness().declare_token(token)
     wait_until(lambda: bool(side.topics().left_out), "it is seen")
     assert side.topics() == RosTopicList((), Counter(malformed=1))
@@ -172,7 +172,7 @@ def test_a_token_that_tells_of_no_publisher_is_counted(session: zenoh.Session, s
 
 
 @pytest.mark.fault("a flood of liveliness tokens", "as many are kept as a vehicle can have, the others counted")
-def test_of_too_many_tokens_the_first_are_kept(
+def test_of_too_many_tokens_the_first_are_retained(
     session: zenoh.Session, side: RosSide, stack: ExitStack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ros_node, "MAX_PUBLISHERS", 100)
@@ -193,7 +193,7 @@ def test_what_a_service_says_itself_is_no_topic_of_the_vehicles(session: zenoh.S
         declared.undeclare()
 
 
-def test_who_is_missing_is_told_with_those_who_are_there(session: zenoh.Session, side: RosSide) -> None:
+def test_who_is_missing_is_reported_with_those_who_are_there(session: zenoh.Session, side: RosSide) -> None:
     token = session.liveliness().declare_token(DRIVER)
     wait_until(lambda: bool(side.topics().publishers), "it is seen")
     topics = side.topics()

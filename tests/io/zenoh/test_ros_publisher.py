@@ -132,8 +132,8 @@ def test_whoever_comes_later_gets_the_last_message_of_a_latched_topic(
     sample = samples.get(timeout=TIMEOUT_S)
     assert sample.payload.to_bytes() == b"second"
     assert sample.attachment is not None
-    assert (told := MessageAttachment.parse(sample.attachment.to_bytes())) is not None
-    assert told.sequence == 2
+    assert (reported := MessageAttachment.parse(sample.attachment.to_bytes())) is not None
+    assert reported.sequence == 2
     late.undeclare()
 
 
@@ -144,7 +144,7 @@ def test_nobody_listens_to_a_topic_that_nobody_subscribes_to(session: zenoh.Sess
     assert publishers.publisher("/tf_static", STRING, STATIC).has_subscribers
 
 
-def test_beside_a_bridge_messages_go_bare_on_plain_keys(session: zenoh.Session, client: zenoh.Session) -> None:
+def test_next_to_a_bridge_messages_go_bare_on_plain_keys(session: zenoh.Session, client: zenoh.Session) -> None:
     publishers = publishers_of(session, Ros2dds(str(session.info.zid()), ""))
     publisher = publishers.publisher("/chatter", STRING, RELIABLE)
     subscriber = client.declare_subscriber("chatter", queued())
@@ -197,8 +197,8 @@ def test_a_service_publishes_as_its_configuration_says(
     publishers = publishers_of(session, dialect)
 
     assert publishers.publisher("/tf_static", TF, STATIC).key == key
-    wanted = token.replace("ZID", str(session.info.zid()))
-    wait_until(lambda: tokens(client, wanted) == {wanted}, "the token", TIMEOUT_S)
+    expected = token.replace("ZID", str(session.info.zid()))
+    wait_until(lambda: tokens(client, expected) == {expected}, "the token", TIMEOUT_S)
 
 
 def test_a_session_that_starts_anew_is_another_publisher() -> None:

@@ -34,16 +34,16 @@ DOORS = (
     "a listener that lets in anybody, in the configuration or a Zenoh file",
     "it is refused unless it is explicitly allowed",
 )
-@pytest.mark.parametrize("said", DOORS)
-def test_a_door_for_everybody_in_a_file_is_refused_unless_spelled_out(tmp_path: Path, said: str) -> None:
+@pytest.mark.parametrize("reported", DOORS)
+def test_a_door_for_everybody_in_a_file_is_refused_unless_spelled_out(tmp_path: Path, reported: str) -> None:
     with pytest.raises(ConfigError, match=r"whoever reaches t.*zenoh.insecure"):
-        settings_of(of_file(tmp_path, f"{{ {said} }}"), LIMITS)
-    (door,) = unguarded(settings_of(of_file(tmp_path, f"{{ {said} }}", insecure=True), LIMITS))
-    assert door in said
+        settings_of(of_file(tmp_path, f"{{ {reported} }}"), LIMITS)
+    (door,) = unguarded(settings_of(of_file(tmp_path, f"{{ {reported} }}", insecure=True), LIMITS))
+    assert door in reported
 
 
 @pytest.mark.parametrize(
-    "said",
+    "reported",
     [
         "",
         'mode: "peer"',
@@ -53,8 +53,8 @@ def test_a_door_for_everybody_in_a_file_is_refused_unless_spelled_out(tmp_path: 
         'listen: { endpoints: ["tls/[::]:7448"] }, transport: { link: { tls: { enable_mtls: true } } }',
     ],
 )
-def test_what_lets_nobody_in_unknown_is_allowed(tmp_path: Path, said: str) -> None:
-    assert unguarded(settings_of(of_file(tmp_path, f"{{ {said} }}"), LIMITS)) == ()
+def test_what_lets_nobody_in_unknown_is_allowed(tmp_path: Path, reported: str) -> None:
+    assert unguarded(settings_of(of_file(tmp_path, f"{{ {reported} }}"), LIMITS)) == ()
 
 
 def test_the_router_that_is_the_service_is_held_to_the_same() -> None:
@@ -68,13 +68,13 @@ def test_the_router_that_is_the_service_is_held_to_the_same() -> None:
 
 @pytest.mark.fault("a key in an endpoint that is refused", "the message does not show the key")
 @pytest.mark.parametrize("endpoint", [f"tls/[::]:1#listen_private_key_base64={SECRET}", f"tls/h#password={SECRET}"])
-def test_a_refusal_does_not_tell_a_secret(endpoint: str) -> None:
+def test_a_refusal_does_not_report_a_secret(endpoint: str) -> None:
     with pytest.raises(ConfigError) as refused:
         settings_of(ZenohConfig(embedded_router=True, listen=(endpoint,)), LIMITS)
     assert SECRET not in str(refused.value)
 
 
-def test_a_damaged_file_does_not_tell_what_is_in_it(tmp_path: Path) -> None:
+def test_a_damaged_file_does_not_report_what_is_in_it(tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as refused:
         settings_of(of_file(tmp_path, f"{{ transport: {{ auth: {{ usrpwd: {{ password: {SECRET} }} }} }} }}"), LIMITS)
     assert SECRET not in str(refused.value)
@@ -106,7 +106,7 @@ def test_a_hostile_file_is_refused_before_it_is_parsed(tmp_path: Path, kind: str
         f"{{ mode: '{SECRET}' }}",
     ],
 )
-def test_what_is_wrong_in_a_file_is_told_without_what_stands_there(tmp_path: Path, text: str) -> None:
+def test_what_is_wrong_in_a_file_is_reported_without_what_stands_there(tmp_path: Path, text: str) -> None:
     with pytest.raises(ConfigError) as refused:
         settings_of(of_file(tmp_path, text), LIMITS)
     assert SECRET not in str(refused.value)

@@ -185,8 +185,10 @@ def test_whatever_a_file_sets_the_session_opens_without_a_router_and_connects_to
     file, names, rules = tmp_path / "session.json5", tmp_path / "names", tmp_path / "router.json5"
     file.write_text(json.dumps(more))
     names.write_text("vehicle:secret\n")
-    asks = {"transport": {"auth": {"usrpwd": {"dictionary_file": str(names)}}}} if "auth" in file.read_text() else {}
-    rules.write_text(json.dumps({"mode": "router", "listen": {"endpoints": [endpoint]}} | asks))
+    requests = (
+        {"transport": {"auth": {"usrpwd": {"dictionary_file": str(names)}}}} if "auth" in file.read_text() else {}
+    )
+    rules.write_text(json.dumps({"mode": "router", "listen": {"endpoints": [endpoint]}} | requests))
     with open_session(ZenohConfig(file=file, connect=(endpoint,)), LIMITS) as service:
         assert not is_connected(service)
         with open_session(ZenohConfig(file=rules), LIMITS) as router:

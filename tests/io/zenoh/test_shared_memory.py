@@ -42,8 +42,8 @@ bus.close(5.0)
 
 def settings(mode: str, endpoint: str, *, shares_memory: bool) -> zenoh.Config:
     """Those of anybody's session, by default in all else."""
-    chosen = zenoh.Config()
-    said = {
+    selected = zenoh.Config()
+    reported = {
         "mode": mode,
         "listen/endpoints": [endpoint] if mode == "router" else [],
         "connect/endpoints": [] if mode == "router" else [endpoint],
@@ -51,16 +51,16 @@ def settings(mode: str, endpoint: str, *, shares_memory: bool) -> zenoh.Config:
         "transport/shared_memory/enabled": shares_memory,
         "transport/shared_memory/mode": "init",  # from its first message on
     }
-    for key, value in said.items():
-        chosen.insert_json5(key, json.dumps(value))
-    return chosen
+    for key, value in reported.items():
+        selected.insert_json5(key, json.dumps(value))
+    return selected
 
 
 @pytest.mark.fault(
     "a router with shared memory, Zenoh's default, is restarted again and again",
     "none of its memory stays in the service",
 )
-def test_no_memory_of_routers_that_are_gone_is_kept(record_property: Any) -> None:
+def test_no_memory_of_routers_that_are_gone_is_retained(record_property: Any) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     shared_mib = []
     command = [sys.executable, "-c", RECEIVER, endpoint]
@@ -78,8 +78,8 @@ def test_no_memory_of_routers_that_are_gone_is_kept(record_property: Any) -> Non
                 wait_until(partial(has_subscribers, sender), "the receiver")
                 for _ in range(MESSAGES):
                     sender.put(PAYLOAD)
-                told = [receiver.stdout.readline() for _ in range(MESSAGES)]
-                shared_mib.append(int(told[-1]) / 1024)
+                report = [receiver.stdout.readline() for _ in range(MESSAGES)]
+                shared_mib.append(int(report[-1]) / 1024)
         receiver.stdin.close()
     assert receiver.returncode == 0
     record_property("figure", f"{shared_mib[-1] - shared_mib[0]:+.0f} MiB after {ROUTERS} routers")

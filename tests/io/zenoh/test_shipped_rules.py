@@ -79,7 +79,7 @@ READABLE = {
     "a last word": KEYS.last(PAIR),
     "last words of all": "coec/@v1/*/last/*",
 }
-LOOKED_FOR = MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
+CHECKED_FOR = MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
 COMMAND = KEYS.command(PAIR, "hold")
 NOT_READABLE = (f"{KEYS.root}/**", "coec/@v1/**", "coec/**", "**", "@/**", "@/*/router", "@/**/config/**", FRAMES)
 
@@ -177,8 +177,8 @@ def test_what_includes_more_than_is_allowed_is_not_answered(town: Town, name: st
 
 def test_the_operator_commands(town: Town, door: ShippedRouter) -> None:
     speaker = CommandSender(door.authority.credentials("operator"), "vehicle")
-    told = send_authenticated(town.operator, f"{COMMAND}?format=json", None, PATIENCE_S, speaker, JSON)
-    assert json.loads(told.payload)["code"] == "held"
+    reported = send_authenticated(town.operator, f"{COMMAND}?format=json", None, PATIENCE_S, speaker, JSON)
+    assert json.loads(reported.payload)["code"] == "held"
 
 
 @pytest.mark.fault(
@@ -228,28 +228,28 @@ def test_frames_go_to_the_vehicle_only(town: Town) -> None:
 @pytest.mark.parametrize("name", ["operator", "viewer", "sensors", "ros"])
 def test_nobody_speaks_for_the_vehicle(town: Town, name: str) -> None:
     asker = "viewer" if name == "operator" else "operator"
-    heard: list[bytes] = []
+    received: list[bytes] = []
 
-    def hear(sample: zenoh.Sample) -> None:
-        heard.append(sample.payload.to_bytes())
+    def listen(sample: zenoh.Sample) -> None:
+        received.append(sample.payload.to_bytes())
 
     def pretend(query: zenoh.Query) -> None:
         with query:
             query.reply(READABLE["health"], b"spoofed")
 
-    subscriber = town.of(asker).declare_subscriber(READABLE["health"], zenoh.handlers.Callback(hear, indirect=False))
+    subscriber = town.of(asker).declare_subscriber(READABLE["health"], zenoh.handlers.Callback(listen, indirect=False))
     spoof = town.of(name).declare_queryable(
         READABLE["health"], zenoh.handlers.Callback(pretend, indirect=False), complete=True
     )
     town.of(name).put(READABLE["health"], b"spoofed")
     seen(town, name)
     replies = town.of(asker).get(READABLE["health"], target=zenoh.QueryTarget.ALL, timeout=PATIENCE_S)
-    told = [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
-    assert len(told) == 1
-    assert b"spoofed" not in told + heard
+    reported = [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+    assert len(reported) == 1
+    assert b"spoofed" not in reported + received
     town.vehicle.bus.publish(READABLE["health"], town.vehicle.bench.answers.health("msgpack"))
-    wait_until(lambda: bool(heard), "the vehicle's own word")
-    assert b"spoofed" not in heard
+    wait_until(lambda: bool(received), "the vehicle's own word")
+    assert b"spoofed" not in received
     subscriber.undeclare()
     spoof.undeclare()
 
@@ -325,18 +325,18 @@ def test_who_comes_late_gets_the_static_transforms(town: Town) -> None:
     key = "0/tf_static/tf2_msgs::msg::dds_::TFMessage_/TypeHashNotSupported"
     for speaker, listener in ((town.ros, town.vehicle_session), (town.vehicle_session, town.ros)):
         publisher = declare_advanced_publisher(
-            speaker, key, publisher_detection=True, cache=CacheConfig(1), sample_miss_detection=LOOKED_FOR
+            speaker, key, publisher_detection=True, cache=CacheConfig(1), sample_miss_detection=CHECKED_FOR
         )
         publisher.put(b"transforms")
         got: list[bytes] = []
 
-        def hear(sample: zenoh.Sample, got: list[bytes] = got) -> None:
+        def listen(sample: zenoh.Sample, got: list[bytes] = got) -> None:
             got.append(sample.payload.to_bytes())
 
         subscriber = declare_advanced_subscriber(
             listener,
             "0/tf_static/*/*",
-            zenoh.handlers.Callback(hear, indirect=False),
+            zenoh.handlers.Callback(listen, indirect=False),
             history=HistoryConfig(detect_late_publishers=True, max_samples=10),
             subscriber_detection=True,
         )
@@ -349,10 +349,10 @@ def test_the_service_speaks_to_ros_but_is_no_driver(town: Town, door: ShippedRou
     by_certificate = door.authority.session("vehicle", door.certified)
     got: list[str] = []
 
-    def hear(sample: zenoh.Sample) -> None:
+    def listen(sample: zenoh.Sample) -> None:
         got.append(str(sample.key_expr))
 
-    subscriber = town.ros.declare_subscriber("0/**", zenoh.handlers.Callback(hear, indirect=False))
+    subscriber = town.ros.declare_subscriber("0/**", zenoh.handlers.Callback(listen, indirect=False))
     forged = f"0{IMAGE_TOPIC}/{type_chunks('CompressedImage')}"
     with connected_by(RouterAddress((door.certified,), by_certificate), PATIENCE_S) as session:
         wait_until(lambda: bool(got or session.put("0/diagnostics/a/b", b"x")), "what the service says")

@@ -74,7 +74,7 @@ def serves(one: SingletonGuard) -> bool:
 
 
 @pytest.mark.fault("several daemons of a vehicle start in any order of looks", "never two serve, and always one does")
-def test_in_no_order_of_looks_do_two_serve_and_one_always_does() -> None:
+def test_in_no_order_of_observations_do_two_serve_and_one_always_does() -> None:
     """Every reachable state of three daemons that start, look and decide in any order, each any number of times."""
     start: tuple[str, ...] = ("new", "new", "new")
     reached, waiting = {start}, [start]
@@ -229,9 +229,9 @@ def test_where_queries_are_forbidden_tokens_count(monkeypatch: pytest.MonkeyPatc
     config = ZenohConfig(connect=(endpoint,))
     with open_session(ZenohConfig(file=file), LIMITS), open_session(config, LIMITS) as here:
         wait_until(lambda: bool(list(here.info.routers_zid())), "the router is there")
-        for key, said in ((FAKED, "by another daemon"), (KEYS.alive("front"), "another session holds the token")):
+        for key, reported in ((FAKED, "by another daemon"), (KEYS.alive("front"), "another session holds the token")):
             one = SingletonGuard(here, config, LIMITS, KEYS, STARTED_NS)
-            with held(here, key), pytest.raises(UnavailableError, match=said):
+            with held(here, key), pytest.raises(UnavailableError, match=reported):
                 one.claim(threading.Event())
             assert one.close(DEADLINE_S)
 
@@ -287,7 +287,7 @@ def hiding(*messages: str) -> dict[str, object]:
 
 @pytest.mark.fault("a router whose rules hide liveliness tokens", "the daemon sees it, and when it is over")
 @pytest.mark.parametrize("messages", [("liveliness_token",), ("liveliness_query",)])
-def test_tokens_that_a_router_hides_are_told_of(
+def test_tokens_that_a_router_hides_are_reported_of(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, messages: tuple[str, ...]
 ) -> None:
     monkeypatch.setattr(singleton, "WATCH_S", 0.02)

@@ -19,7 +19,7 @@ PLACE_RAD = 0.001
 
 def displaced(sigmas: float) -> tuple[Judged, ...]:
     """Three checks of a place, a little apart."""
-    return tuple(judged(float(np.degrees(PLACE_RAD * (sigmas + apart)))) for apart in (-0.1, 0.0, 0.1))
+    return tuple(judged(float(np.degrees(PLACE_RAD * (sigmas + separation)))) for separation in (-0.1, 0.0, 0.1))
 
 
 def farther_than(sigmas: float, checks: Sequence[Judged]) -> bool:
@@ -41,7 +41,7 @@ def test_a_check_that_is_off_alone_displaces_no_place() -> None:
     np.testing.assert_allclose(places.displacement, [1.0])
 
 
-def test_few_checks_do_not_tell_a_place_that_is_off_from_a_bad_check() -> None:
+def test_few_checks_do_not_report_a_place_that_is_off_from_a_bad_check() -> None:
     assert PlaceChecks.from_drives([displaced(1.0)[:2], (judged(9.0),)]).checks == ()
 
 
@@ -50,7 +50,7 @@ def test_a_check_just_after_a_faint_one_may_not_accuse_and_is_of_no_place() -> N
     np.testing.assert_allclose(places.displacement, [1.0])
 
 
-def test_places_count_in_what_their_scene_can_tell() -> None:
+def test_places_count_in_what_their_scene_can_decide() -> None:
     dispersed = tuple(check.model_copy(update={"dispersion": 4.0}) for check in displaced(6.0))
     np.testing.assert_allclose(PlaceChecks.from_drives([dispersed]).displacement, [1.5])
 
@@ -72,8 +72,8 @@ def test_few_places_leave_more_to_the_tail_than_many() -> None:
 
 
 def test_a_detector_that_bears_more_alarms_less() -> None:
-    drawn = np.random.default_rng(3).exponential(0.5, 60)
-    places = PlaceChecks.from_drives([displaced(float(far)) for far in drawn])
+    samples = np.random.default_rng(3).exponential(0.5, 60)
+    places = PlaceChecks.from_drives([displaced(float(far)) for far in samples])
     strict, lenient = (bound(places, 4, 6.0, partial(farther_than, at)) for at in (4.0, 12.0))
     assert strict is not None
     assert lenient is not None
@@ -84,9 +84,9 @@ def test_a_detector_that_bears_more_alarms_less() -> None:
 
 def test_a_detector_that_never_alarms_has_no_rate() -> None:
     places = PlaceChecks.from_drives([displaced(1.0 + 0.01 * n) for n in range(MIN_PLACES)])
-    found = bound(places, 4, 6.0, lambda _: False)
-    assert found is not None
-    assert (found.mean, found.at_most, found.half) == (0.0, 0.0, None)
+    result = bound(places, 4, 6.0, lambda _: False)
+    assert result is not None
+    assert (result.mean, result.at_most, result.half) == (0.0, 0.0, None)
 
 
 def test_too_few_places_have_no_tail() -> None:

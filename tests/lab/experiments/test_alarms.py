@@ -43,13 +43,13 @@ def test_same_stream_same_evidence() -> None:
 
 
 @pytest.mark.parametrize(("off_deg", "share"), [(0.5, 0.95), (1.0, 1.0), (3.0, 1.0)])
-def test_of_a_mount_that_is_wrong_from_the_first_check_a_window_is_wanted_soon(off_deg: float, share: float) -> None:
+def test_of_a_mount_that_is_wrong_from_the_first_check_a_window_is_requested_soon(off_deg: float, share: float) -> None:
     """Whether the mount is wrong or the estimator off by half a degree on this rig, checks alone cannot tell for sure:
     a window has to, and soon."""
-    wanted_s = alarm_statistics.from_start(CONFIG, off_deg, 40).requested_s
-    assert np.median(wanted_s) <= 4 * CONFIG.period_s
-    assert np.mean(np.isfinite(wanted_s)) >= share
+    expected_s = alarm_statistics.from_start(CONFIG, off_deg, 40).requested_s
+    assert np.median(expected_s) <= 4 * CONFIG.period_s
+    assert np.mean(np.isfinite(expected_s)) >= share
 
 
-def test_of_most_right_rigs_none_is_wanted_in_their_first_minute() -> None:
+def test_of_most_right_rigs_none_is_requested_in_their_first_minute() -> None:
     assert np.mean(np.isfinite(alarm_statistics.from_start(CONFIG, 0.0, 20).requested_s)) <= 0.25

@@ -36,7 +36,7 @@ def of(rows: list[CheckedDrive], moved: str) -> MovedStatistics:
     return statistics
 
 
-def test_shares_are_of_checks_that_can_tell() -> None:
+def test_shares_are_of_checks_that_can_decide() -> None:
     right = (
         judged(0.0), judged(1.0), judged(1.0, undecided=True), judged(1.0, faint=("looks",)),
         judged(1.0, causes=("dark",)),

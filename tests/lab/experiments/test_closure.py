@@ -32,7 +32,7 @@ def _rig(T_camera_lidar: Matrix4, camera: str = "a", lidar: str = "top") -> Rig:
     return Rig("pair", view, camera, lidar, T_camera_lidar, np.eye(4))
 
 
-Asked = tuple[str, int, Sequence[int] | None]
+Requested = tuple[str, int, Sequence[int] | None]
 """Of whom, in which trial, on which frames."""
 
 XI = _xi(0.02, -0.01, 0.03, 0.004, 0.002, -0.003)
@@ -49,7 +49,7 @@ def test_true_calibrations_close_and_an_error_of_b_shows_as_it_is(relation: Rela
 
 
 @pytest.mark.parametrize("relation", list(Relation))
-def test_errors_of_a_show_as_the_jacobian_tells(relation: Relation) -> None:
+def test_errors_of_a_show_as_the_jacobian_reports(relation: Relation) -> None:
     known = Between(relation, T_B_A)
     result = known.error(_outcome(se3.perturb(T_A, XI)), _outcome(known.predicted(T_A)))
     assert result is not None
@@ -76,14 +76,16 @@ def test_sensors_that_share_nothing_cannot_close() -> None:
         between(_rig(T_A, "a", "top"), _rig(T_A, "b", "front"), None)
 
 
-def _close(pairs: tuple[int, int], dof: int = 6, accepted: bool = True) -> tuple[list[Asked], dict[FrameChoice, float]]:
+def _close(
+    pairs: tuple[int, int], dof: int = 6, accepted: bool = True
+) -> tuple[list[Requested], dict[FrameChoice, float]]:
     """The frames that were asked of A and B, and the median rotation (rad) of the closure on each kind of frames."""
     known = Between(Relation.CAMERAS, T_B_A)
-    asked: list[Asked] = []
+    requested: list[Requested] = []
 
     def solve(name: str, T: Matrix4) -> Solve:
         def of(trial: int, frames: Sequence[int] | None) -> SolveOutcome:
-            asked.append((name, trial, frames))
+            requested.append((name, trial, frames))
             return _outcome(T, accepted=accepted)
 
         return of
@@ -91,14 +93,14 @@ def _close(pairs: tuple[int, int], dof: int = 6, accepted: bool = True) -> tuple
     off = se3.perturb(known.predicted(T_A), _xi(0.5))
     closures = close(known, solve("a", T_A), solve("b", off), pairs, 2, dof, lambda *_: None)
     assert all(np.isnan(closure.translation_m.median) == (dof == 3 or not accepted) for closure in closures)
-    return asked, {closure.frames: closure.rotation_rad.median for closure in closures}
+    return requested, {closure.frames: closure.rotation_rad.median for closure in closures}
 
 
 def test_all_frames_the_same_half_and_other_halves() -> None:
-    asked, medians = _close((6, 7))
+    requested, medians = _close((6, 7))
     assert list(medians) == list(FrameChoice)
     assert list(medians.values()) == pytest.approx([radians(0.5)] * 3)
-    of_first = [frames for _, trial, frames in asked if trial == 0]
+    of_first = [frames for _, trial, frames in requested if trial == 0]
     assert of_first[:2] == [None, None]
     a, b_shared, b_other = ([] if frames is None else list(frames) for frames in of_first[2:])
     assert a == b_shared

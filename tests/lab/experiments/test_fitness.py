@@ -50,7 +50,7 @@ def a_recording(
 
 
 def codes(recording: FramewiseRecording) -> dict[str, str]:
-    return {remark.code: remark.level for remark in fitness_of(recording).remarks}
+    return {comment.code: comment.level for comment in fitness_of(recording).remarks}
 
 
 def test_the_figures_of_a_recording() -> None:
@@ -65,10 +65,10 @@ def test_the_figures_of_a_recording() -> None:
     assert seen.standing == 0.0
 
 
-def test_clocks_that_are_apart_are_named_with_the_way_out() -> None:
-    (remark,) = (r for r in fitness_of(a_recording(late_ms=-3_600_000)).remarks if r.code == "no_pairs")
-    assert "the clouds are 3600.000 s ahead of the images" in remark.text
-    assert "PTP" in remark.text
+def test_clocks_that_are_separate_are_named_with_the_way_out() -> None:
+    (comment,) = (r for r in fitness_of(a_recording(late_ms=-3_600_000)).remarks if r.code == "no_pairs")
+    assert "the clouds are 3600.000 s ahead of the images" in comment.text
+    assert "PTP" in comment.text
 
 
 def test_points_that_are_left_out_are_named() -> None:
@@ -81,13 +81,13 @@ def test_points_that_are_left_out_are_named() -> None:
     frames = tuple(map(with_some, recording.frames))
     seen = fitness_of(replace(recording, frames=frames))
     assert seen.not_finite == pytest.approx(0.2)
-    (remark,) = (r for r in seen.remarks if r.code == "not_finite")
-    assert (remark.level, remark.text[:17]) == ("ok", "20% of the points")
+    (comment,) = (r for r in seen.remarks if r.code == "not_finite")
+    assert (comment.level, comment.text[:17]) == ("ok", "20% of the points")
 
 
-def test_a_cadence_tells_its_longest_gap() -> None:
-    told = cadence([0, 100 * MS, 200 * MS, 1200 * MS])
-    np.testing.assert_allclose([told.rate_hz, told.longest_gap_s], [10.0, 1.0])
+def test_a_cadence_reports_its_longest_gap() -> None:
+    reported = cadence([0, 100 * MS, 200 * MS, 1200 * MS])
+    np.testing.assert_allclose([reported.rate_hz, reported.longest_gap_s], [10.0, 1.0])
     assert cadence([]).frames == 0
     assert cadence([5]).rate_hz == 0.0
 
@@ -103,12 +103,12 @@ def test_a_cadence_tells_its_longest_gap() -> None:
         (a_recording(ring=True), "constant_ring", "warn"),
     ],
 )
-def test_what_is_missing_is_said(recording: FramewiseRecording, code: str, level: str) -> None:
+def test_what_is_missing_is_reported(recording: FramewiseRecording, code: str, level: str) -> None:
     assert codes(recording)[code] == level
 
 
 @pytest.mark.parametrize(
-    ("times_s", "told"),
+    ("times_s", "reported"),
     [
         (np.linspace(0.0, 0.1, 60), 1),
         (np.tile(np.linspace(0.0, 0.1, 30), 2), 2),
@@ -120,14 +120,16 @@ def test_what_is_missing_is_said(recording: FramewiseRecording, code: str, level
     ],
     ids=range(7),
 )
-def test_passes_are_counted_in_the_order_in_which_points_lie(times_s: NDArray[np.float64] | None, told: int) -> None:
+def test_passes_are_counted_in_the_order_in_which_points_lie(
+    times_s: NDArray[np.float64] | None, reported: int
+) -> None:
     count = 5 if times_s is None else len(times_s)
     times = None if times_s is None else times_s.astype(np.float32)
-    assert passes(LidarFrame(0, "lidar", np.ones((count, 3), np.float32), time_offset_s=times)) == told
+    assert passes(LidarFrame(0, "lidar", np.ones((count, 3), np.float32), time_offset_s=times)) == reported
 
 
-@pytest.mark.parametrize(("rings", "told"), [(False, True), (True, False)])
-def test_a_cloud_that_may_be_of_several_lidars_is_said(rings: bool, told: bool) -> None:
+@pytest.mark.parametrize(("rings", "reported"), [(False, True), (True, False)])
+def test_a_cloud_that_may_be_of_several_lidars_is_reported(rings: bool, reported: bool) -> None:
     recording = a_recording(ring=rings)
     times_s = np.array([0.0, 0.1, 0.0, 0.1], np.float32)
 
@@ -135,10 +137,10 @@ def test_a_cloud_that_may_be_of_several_lidars_is_said(rings: bool, told: bool) 
         return replace(frame, load_lidar=lambda: replace(frame.load_lidar(), time_offset_s=times_s))
 
     timed_recording = replace(recording, frames=tuple(map(timed, recording.frames)))
-    assert ("perhaps_concatenated" in codes(timed_recording)) is told
+    assert ("perhaps_concatenated" in codes(timed_recording)) is reported
 
 
-def test_an_extrinsic_the_wrong_way_round_is_said() -> None:
+def test_an_extrinsic_the_wrong_way_round_is_reported() -> None:
     away = FORWARD.copy()
     away[2, 3] = -100.0
     assert codes(a_recording(rig=replace(RIG, T_camera_lidar_nominal=away)))["little_in_view"] == "fail"

@@ -62,13 +62,13 @@ def test_a_wrong_lens_shifts_the_rim_and_not_the_middle() -> None:
     assert np.corrcoef(columns, right)[0, 1] < -0.9
 
 
-def test_beyond_what_is_tried_nothing_is_told() -> None:
+def test_beyond_what_is_tried_nothing_is_reported() -> None:
     window = _several(scenes.post_window((-20.0, 20.0)))
     moved = se3.perturb(window.T_camera_lidar_start, np.array([0, radians(3.0), 0, 0, 0, 0]))
     assert not _shifts(window, moved).known.any()
 
 
-def test_few_range_edges_tell_nothing_and_none_are_no_error() -> None:
+def test_few_range_edges_are_uninformative_and_none_are_no_error() -> None:
     window = scenes.post_window((0.0,))
     assert not _shifts(window, window.T_camera_lidar_start).known.any()
     (pair,) = window.pairs

@@ -119,7 +119,7 @@ def test_groups_add_up_to_the_whole() -> None:
     assert (report.drives, report.failed) == (3, {"c": "no file"})
 
 
-def test_alarms_at_the_right_pose_are_false_and_elsewhere_wanted() -> None:
+def test_alarms_at_the_right_pose_are_false_and_elsewhere_requested() -> None:
     rows = [
         row("a", solved(), watched=(watch("right", 0, flagged=1), watch("1 deg", 1, flagged=5, delay=3))),
         row("b", solved(), watched=(watch("right", 1, flagged=3, delay=4, blind=1), watch("1 deg", 0))),
@@ -164,7 +164,7 @@ def test_faults_of_scene_light_and_fault_go_together() -> None:
     assert "depth=yes" in source
 
 
-def test_drives_are_chosen_by_their_name() -> None:
+def test_drives_are_selected_by_their_name() -> None:
     night = matrix_drives.selected_drives(1, "*_night_*")
     assert night
     assert all(drive.light == "night" for drive in night)
@@ -176,8 +176,8 @@ def test_drives_are_chosen_by_their_name() -> None:
 def test_a_start_is_off_by_what_is_searched_and_what_is_held_by_what_the_budget_says() -> None:
     held = np.array([matrix_drives.sampled_start(drive.name, 0, 3, 0.01) for drive in DRIVES])
     searched = np.array([matrix_drives.sampled_start(drive.name, 0, 6, 0.01) for drive in DRIVES])
-    for drawn in (held, searched):
-        turned = np.degrees(np.linalg.norm(drawn[:, :3], axis=1))
+    for rendered in (held, searched):
+        turned = np.degrees(np.linalg.norm(rendered[:, :3], axis=1))
         assert (turned >= 2.0).all()
         assert (turned <= 10.0).all()
     np.testing.assert_allclose(held[:, 3:].std(axis=0), 0.01, rtol=0.3)

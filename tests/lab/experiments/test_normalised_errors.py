@@ -31,25 +31,25 @@ def _claims(errors: list[list[float]], sigma: float | list[float]) -> Claims:
     return Claims(np.array(errors), np.tile(covariance, (len(errors), 1, 1)), refused=0)
 
 
-def _ended(*deg: float, sigma_deg: float = 0.1, accepted: bool = True) -> SolveOutcome:
+def _finished(*deg: float, sigma_deg: float = 0.1, accepted: bool = True) -> SolveOutcome:
     return score(Trial(FAR, _estimate(_xi(*deg), accepted, radians(sigma_deg)), 1.0), REFERENCE, 3)
 
 
 def test_coverage_counts_errors_within_claims() -> None:
-    found = normalise(_claims([[0.5] * 6, [-1.5] * 6, [2.5] * 6, [-4.0] * 6], 1.0), independent=4)
-    np.testing.assert_array_equal(found.coverage, np.array([[0.25] * 6, [0.5] * 6, [0.75] * 6]))
-    np.testing.assert_allclose(found.rms, np.sqrt((0.25 + 2.25 + 6.25 + 16.0) / 4.0))
-    np.testing.assert_array_equal(found.largest, 4.0)
-    np.testing.assert_allclose(found.sigma_over_rms, 1.0 / found.rms)
-    assert found.nees == pytest.approx((0.25 + 2.25 + 6.25 + 16.0) / 4.0)
+    result = normalise(_claims([[0.5] * 6, [-1.5] * 6, [2.5] * 6, [-4.0] * 6], 1.0), independent=4)
+    np.testing.assert_array_equal(result.coverage, np.array([[0.25] * 6, [0.5] * 6, [0.75] * 6]))
+    np.testing.assert_allclose(result.rms, np.sqrt((0.25 + 2.25 + 6.25 + 16.0) / 4.0))
+    np.testing.assert_array_equal(result.largest, 4.0)
+    np.testing.assert_allclose(result.sigma_over_rms, 1.0 / result.rms)
+    assert result.nees == pytest.approx((0.25 + 2.25 + 6.25 + 16.0) / 4.0)
 
 
 def test_histogram_keeps_the_sign_and_its_ends_are_open() -> None:
-    found = normalise(_claims([[-9.0] * 6, [-0.2] * 6, [0.2] * 6, [9.0] * 6], 1.0), independent=4)
+    result = normalise(_claims([[-9.0] * 6, [-0.2] * 6, [0.2] * 6, [9.0] * 6], 1.0), independent=4)
     middle = len(BIN_EDGES) // 2
     expected = np.zeros(len(BIN_EDGES) - 1, int)
     expected[[0, middle - 1, middle, -1]] = 1
-    for counts in found.histogram:
+    for counts in result.histogram:
         np.testing.assert_array_equal(counts, expected)
 
 
@@ -70,41 +70,41 @@ def test_correlated_errors_are_measured_along_their_ellipse() -> None:
     along, across = np.zeros(6), np.zeros(6)
     along[[0, 4]], across[0], across[4] = 1.0, 1.0, -1.0
     claims = gathered([(along, covariance)]), gathered([(across, covariance)])
-    found = [normalise(claim, 1).nees * 6.0 for claim in claims]
-    assert found == pytest.approx([2.0 / 1.9, 2.0 / 0.1])
+    result = [normalise(claim, 1).nees * 6.0 for claim in claims]
+    assert result == pytest.approx([2.0 / 1.9, 2.0 / 0.1])
 
 
 def test_bounds_are_those_of_the_results_that_share_no_frame() -> None:
     claims = _claims([[1.0] * 6] * 10, 1.0)
-    apart, same = normalise(claims, independent=10), normalise(claims, independent=1)
+    separation, same = normalise(claims, independent=10), normalise(claims, independent=1)
     # χ² of 60 degrees of freedom: 40.482 and 83.298; of 6: 1.237 and 14.449.
-    assert apart.nees_bounds == pytest.approx((40.482 / 60, 83.298 / 60), rel=0.01)
+    assert separation.nees_bounds == pytest.approx((40.482 / 60, 83.298 / 60), rel=0.01)
     assert same.nees_bounds == pytest.approx((1.237 / 6, 14.449 / 6), rel=0.03)
 
 
 def test_axes_of_which_nothing_is_claimed_stand_in_no_figure() -> None:
-    found = normalise(_claims([[1.0] * 6], [1.0, 1.0, 1.0, np.nan, np.nan, np.nan]), 1)
-    for figures in (found.rms, found.largest, found.sigma, found.sigma_over_rms, found.coverage[0]):
+    result = normalise(_claims([[1.0] * 6], [1.0, 1.0, 1.0, np.nan, np.nan, np.nan]), 1)
+    for figures in (result.rms, result.largest, result.sigma, result.sigma_over_rms, result.coverage[0]):
         assert np.isfinite(figures[:3]).all()
         assert np.isnan(figures[3:]).all()
-    assert found.histogram[3:].sum() == 0
-    assert found.nees == pytest.approx(1.0)
+    assert result.histogram[3:].sum() == 0
+    assert result.nees == pytest.approx(1.0)
 
 
 def test_without_a_claim_there_is_no_figure_and_no_error() -> None:
-    found = normalise(gathered([None, None]), 2)
-    assert (found.judged, found.refused, found.independent) == (0, 2, 0)
-    assert np.isnan([*found.rms, *found.coverage.ravel(), found.nees, *found.nees_bounds]).all()
+    result = normalise(gathered([None, None]), 2)
+    assert (result.judged, result.refused, result.independent) == (0, 2, 0)
+    assert np.isnan([*result.rms, *result.coverage.ravel(), result.nees, *result.nees_bounds]).all()
 
 
 def test_refused_results_claim_nothing() -> None:
-    claims = of_outcomes([_ended(0.1), _ended(0.2, accepted=False), _ended(0.3, sigma_deg=np.nan)])
+    claims = of_outcomes([_finished(0.1), _finished(0.2, accepted=False), _finished(0.3, sigma_deg=np.nan)])
     assert (len(claims.errors), claims.refused) == (1, 2)
     np.testing.assert_allclose(np.degrees(claims.errors[0, 0]), 0.1)
 
 
 def test_axes_that_were_not_solved_claim_nothing() -> None:
-    outcome = _ended(0.1)
+    outcome = _finished(0.1)
     estimate = outcome.trial.estimate
     assert estimate is not None
     solved = np.arange(6) < 3
@@ -114,7 +114,7 @@ def test_axes_that_were_not_solved_claim_nothing() -> None:
 
 
 def test_variances_of_two_halves_add_up() -> None:
-    claims = of_differences([(_ended(0.3), _ended(0.0)), (_ended(0.0), _ended(0.0, accepted=False))])
+    claims = of_differences([(_finished(0.3), _finished(0.0)), (_finished(0.0), _finished(0.0, accepted=False))])
     assert claims.refused == 1
     np.testing.assert_allclose(np.degrees(claims.errors[0, :3]), [0.3, 0.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(np.diagonal(claims.covariances[0]), 2.0 * radians(0.1) ** 2)

@@ -49,9 +49,9 @@ def test_points_crowd_about_the_pose() -> None:
 
 
 def test_views_are_those_of_every_landscape() -> None:
-    heard: list[tuple[int, str]] = []
+    received: list[tuple[int, str]] = []
     named = {"one": _Hill(SUMMIT), "other": _Hill(-SUMMIT)}
-    seen = views(named, REFERENCE, 3, lambda done, name: heard.append((done, name)))
+    seen = views(named, REFERENCE, 3, lambda done, name: received.append((done, name)))
     assert list(seen) == ["one", "other"]
-    assert heard == [(1, "one"), (2, "other")]
+    assert received == [(1, "one"), (2, "other")]
     assert seen["one"].narrow[0].best_offset > 0 > seen["other"].narrow[0].best_offset

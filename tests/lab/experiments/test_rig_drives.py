@@ -52,9 +52,9 @@ def truth(drive: DisplacedRigDrive, camera: str, mounts: Mounts, stamp_ns: int) 
     return np.asarray(pose(camera, Mounts.CAMERA) @ se3.inverse(pose(LIDAR, Mounts.LIDAR)))
 
 
-def drawn(number: int) -> RigDriveRow:
+def rendered(number: int) -> RigDriveRow:
     """Looks as those of a drive that was rendered: at the truth, but for noise."""
-    drive, rng, looks = DisplacedRigDrive(number, CAMERA), np.random.default_rng(number), []
+    drive, rng, observations = DisplacedRigDrive(number, CAMERA), np.random.default_rng(number), []
     for turn in range(CHECK_PAIRS, round((drive.at_s + 22.0) / TURN_S)):
         stamps_ns = tuple(START_NS + round((turn - k) * TURN_S * 1e9) for k in range(CHECK_PAIRS, 0, -1))
         for camera in due(turn, drive.right.cameras):
@@ -63,33 +63,37 @@ def drawn(number: int) -> RigDriveRow:
                 if mounts is Mounts.CAMERA and camera not in drive.cameras:
                     continue
                 offset = se3.difference(truth(drive, camera, mounts, stamps_ns[-1]), served) + noise
-                looks.append(
+                observations.append(
                     RigLook(
                         edge=f"{camera}-{LIDAR}", mounts=mounts, pair_stamps_ns=stamps_ns, offset=six(offset),
                         sigma=six(SIGMA), noise=six(NOISE), place=six(PLACE), dispersion=1.0, distance2=0.5,
                         flagged=False, weak=False, causes=(),
                     )
                 )  # fmt: skip
-    return RigDriveRow(name=drive.name, seed=FIRST_SEED + number, camera=CAMERA, looks=tuple(looks))
+    return RigDriveRow(name=drive.name, seed=FIRST_SEED + number, camera=CAMERA, looks=tuple(observations))
 
 
 def flagged(row: RigDriveRow, edge: str, *, weak: bool = False) -> RigDriveRow:
     """The looks of a pair whose camera was knocked accuse the mount, if it was."""
 
-    def told(look: RigLook) -> RigLook:
-        moved = look.edge == edge and look.mounts is Mounts.CAMERA
-        late = look.pair_stamps_ns[0] - START_NS > DisplacedRigDrive(1, CAMERA).at_s * 1e9
-        return look.model_copy(update={"flagged": True, "weak": weak, "distance2": 40.0}) if moved and late else look
+    def reported(observation: RigLook) -> RigLook:
+        moved = observation.edge == edge and observation.mounts is Mounts.CAMERA
+        late = observation.pair_stamps_ns[0] - START_NS > DisplacedRigDrive(1, CAMERA).at_s * 1e9
+        return (
+            observation.model_copy(update={"flagged": True, "weak": weak, "distance2": 40.0})
+            if moved and late
+            else observation
+        )
 
-    return row.model_copy(update={"looks": tuple(map(told, row.looks))})
+    return row.model_copy(update={"looks": tuple(map(reported, row.looks))})
 
 
 @pytest.fixture(scope="module")
 def rows() -> list[RigDriveRow]:
-    return [drawn(1)]
+    return [rendered(1)]
 
 
-def test_pairs_take_turns_and_each_is_looked_at_once_in_a_period() -> None:
+def test_pairs_take_turns_and_each_is_checked_once_in_a_period() -> None:
     turns = [(turn, pair) for turn in range(60) for pair in due(turn, ("a", "b", "c", "d"))]
     assert {pair for turn, pair in turns if turn < 2 * CHECK_PAIRS} == {"a", "b", "c", "d"}
     assert len({turn for turn, _ in turns}) == len(turns), "never two at once: who moved is asked of each"
@@ -99,11 +103,11 @@ def test_pairs_take_turns_and_each_is_looked_at_once_in_a_period() -> None:
         assert set(np.diff(own)) == {round(PERIOD_S / TURN_S)}
 
 
-def test_those_that_were_knocked_are_named_fault_by_fault(rows: list[RigDriveRow]) -> None:
-    told = report([*rows, rows[0].model_copy(update={"looks": (), "failure": "CalibrationError: no"})], CAMERA)
-    assert (told.drives, told.failed, told.faint, told.blind) == (1, 1, 0, 0)
-    assert told.looks == sum(len(row.looks) for row in rows)
-    by_fault = {row.fault: row for row in told.moves}
+def test_those_that_were_displaced_are_named_fault_by_fault(rows: list[RigDriveRow]) -> None:
+    reported = report([*rows, rows[0].model_copy(update={"looks": (), "failure": "CalibrationError: no"})], CAMERA)
+    assert (reported.drives, reported.failed, reported.faint, reported.blind) == (1, 1, 0, 0)
+    assert reported.looks == sum(len(row.looks) for row in rows)
+    by_fault = {row.fault: row for row in reported.moves}
     for fault, row in by_fault.items():
         assert (row.drives, row.undecided) == (1, 0), fault
         assert (row.right, row.wrong) == ((0, 1) if row.each[0].wrong else (1, 0)), fault
@@ -123,36 +127,36 @@ def test_a_sensor_that_stood_still_and_is_named_counts_as_wrong(rows: list[RigDr
     drive = DisplacedRigDrive(1, CAMERA)
     edge = f"{drive.cameras[0]}-{LIDAR}"
     swapped = tuple(
-        look.model_copy(update={"mounts": Mounts.AS_BUILT})
-        for look in rows[0].looks
-        if look.mounts is (Mounts.CAMERA if look.edge == edge else Mounts.AS_BUILT)
+        observation.model_copy(update={"mounts": Mounts.AS_BUILT})
+        for observation in rows[0].looks
+        if observation.mounts is (Mounts.CAMERA if observation.edge == edge else Mounts.AS_BUILT)
     )
-    told = moves_of(rows[0].model_copy(update={"looks": swapped}), NOBODY)
-    assert told.wrong == (drive.cameras[0],)
-    assert told.wrong_s is not None
-    assert told.wrong_s >= 0.0
+    reported = moves_of(rows[0].model_copy(update={"looks": swapped}), NOBODY)
+    assert reported.wrong == (drive.cameras[0],)
+    assert reported.wrong_s is not None
+    assert reported.wrong_s >= 0.0
 
 
-def test_one_that_nothing_tells_of_is_not_named(rows: list[RigDriveRow]) -> None:
+def test_one_that_nothing_determines_of_is_not_named(rows: list[RigDriveRow]) -> None:
     drive = DisplacedRigDrive(1, CAMERA)
-    blind = tuple(look for look in rows[0].looks if not look.edge.startswith(drive.cameras[0]))
-    told = moves_of(rows[0].model_copy(update={"looks": blind}), SensorDisplacement("one camera", cameras=1))
-    assert (told.named_s, told.wrong) == (None, ())
+    blind = tuple(observation for observation in rows[0].looks if not observation.edge.startswith(drive.cameras[0]))
+    reported = moves_of(rows[0].model_copy(update={"looks": blind}), SensorDisplacement("one camera", cameras=1))
+    assert (reported.named_s, reported.wrong) == (None, ())
 
 
-def test_a_pair_that_suspects_a_move_asks_for_windows_and_not_again_before_the_answer(rows: list[RigDriveRow]) -> None:
+def test_a_pair_that_suspects_a_move_requests_windows_and_not_again_before_the_answer(rows: list[RigDriveRow]) -> None:
     drive = DisplacedRigDrive(1, CAMERA)
     knock_ns, period_ns = START_NS + drive.at_s * 1e9, PERIOD_S * 1e9
     edge = f"{drive.cameras[0]}-{LIDAR}"
-    looks, late_ns = flagged(rows[0], edge).looks, answer_ns(Mounts.CAMERA)
-    assert list(request_stamps_ns(drive.served[edge], variant(looks, edge, Mounts.AS_BUILT), late_ns)) == []
-    first, *others = request_stamps_ns(drive.served[edge], variant(looks, edge, Mounts.CAMERA), late_ns)
+    observations, late_ns = flagged(rows[0], edge).looks, answer_ns(Mounts.CAMERA)
+    assert list(request_stamps_ns(drive.served[edge], variant(observations, edge, Mounts.AS_BUILT), late_ns)) == []
+    first, *others = request_stamps_ns(drive.served[edge], variant(observations, edge, Mounts.CAMERA), late_ns)
     assert knock_ns < first < knock_ns + 4 * period_ns
     assert all(later - earlier >= late_ns for earlier, later in pairwise([first, *others]))
 
 
 @pytest.mark.slow  # the attribution has a short form: calibration/rig/test_attribution.py
-def test_where_looks_are_too_faint_an_accepted_window_names_the_camera(rows: list[RigDriveRow]) -> None:
+def test_where_observations_are_too_faint_an_accepted_window_names_the_camera(rows: list[RigDriveRow]) -> None:
     drive = DisplacedRigDrive(1, CAMERA)
     edge = f"{drive.cameras[0]}-{LIDAR}"
     faint = flagged(rows[0], edge, weak=True)
@@ -175,7 +179,7 @@ def test_where_looks_are_too_faint_an_accepted_window_names_the_camera(rows: lis
 
 
 @pytest.mark.slow
-def test_a_drive_is_drawn_and_looked_at_pair_by_pair(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_is_rendered_and_checked_pair_by_pair(monkeypatch: pytest.MonkeyPatch) -> None:
     """As small and short as it goes: what the looks say of so few pixels is of no interest."""
     monkeypatch.setattr(rig_drives, "AT_S", (6.5, 6.6))
     monkeypatch.setattr(rig_drives, "AFTER_S", 2.0)
@@ -183,14 +187,20 @@ def test_a_drive_is_drawn_and_looked_at_pair_by_pair(monkeypatch: pytest.MonkeyP
     row = driven(drive)
     assert row.failure is None
     assert (row.name, row.seed) == (f"fisheye64_{FIRST_SEED}", FIRST_SEED)
-    as_built = [look for look in row.looks if look.mounts is Mounts.AS_BUILT]
-    assert sorted(look.edge for look in as_built) == [f"{camera}-{LIDAR}" for camera in sorted(drive.right.cameras)]
-    assert all(len(look.pair_stamps_ns) == CHECK_PAIRS for look in row.looks)
-    last = [look.pair_stamps_ns[-1] for look in row.looks]
+    as_built = [observation for observation in row.looks if observation.mounts is Mounts.AS_BUILT]
+    assert sorted(observation.edge for observation in as_built) == [
+        f"{camera}-{LIDAR}" for camera in sorted(drive.right.cameras)
+    ]
+    assert all(len(observation.pair_stamps_ns) == CHECK_PAIRS for observation in row.looks)
+    last = [observation.pair_stamps_ns[-1] for observation in row.looks]
     assert last == sorted(last)
-    for look in row.looks:
-        moved = look.mounts is not Mounts.AS_BUILT
-        assert not moved or look.pair_stamps_ns[-1] + 50_000_000 >= START_NS + drive.at_s * 1e9
-        assert look.mounts is not Mounts.CAMERA or look.edge.split("-")[0] in drive.cameras
-    late = {look.edge for look in as_built if look.pair_stamps_ns[-1] - START_NS > (drive.at_s + 0.1) * 1e9}
-    assert late == {look.edge for look in row.looks if look.mounts is Mounts.LIDAR}
+    for observation in row.looks:
+        moved = observation.mounts is not Mounts.AS_BUILT
+        assert not moved or observation.pair_stamps_ns[-1] + 50_000_000 >= START_NS + drive.at_s * 1e9
+        assert observation.mounts is not Mounts.CAMERA or observation.edge.split("-")[0] in drive.cameras
+    late = {
+        observation.edge
+        for observation in as_built
+        if observation.pair_stamps_ns[-1] - START_NS > (drive.at_s + 0.1) * 1e9
+    }
+    assert late == {observation.edge for observation in row.looks if observation.mounts is Mounts.LIDAR}

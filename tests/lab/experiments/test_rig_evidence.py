@@ -27,30 +27,34 @@ from coec_lab.experiments.rig_evidence import (
 STILL = Happening(FULL.poses, FULL.poses, None, 0.0, 1500.0)
 
 
-def scattered(heard: list[TimedEvidence], name: str) -> NDArray[np.float64]:
+def scattered(received: list[TimedEvidence], name: str) -> NDArray[np.float64]:
     """(N, 6) of the looks at an edge, about their middle: its bias is drawn once."""
     edge = FULL.graph.edge[name]
-    offsets = np.array([se3.difference(look.T_a_b, edge.T_a_b) for _, look in heard if look.edge == name])
+    offsets = np.array(
+        [se3.difference(observation.T_a_b, edge.T_a_b) for _, observation in received if observation.edge == name]
+    )
     return np.asarray(offsets - np.median(offsets, axis=0))
 
 
-def test_looks_at_two_lidars_come_in_their_time_and_scatter_as_those_on_streets() -> None:
-    heard = simulate_checks(FULL, STILL, np.random.default_rng(4))
-    assert heard == sorted(heard, key=lambda one: one[0])
-    of_lidars = [(at_s, look) for at_s, look in heard if look.edge in FULL.graph.of_lidars]
-    assert all(at_s - look.stamp_ns / NS_PER_S == pytest.approx(LIDAR_LATE_S) for at_s, look in of_lidars)
-    spaced = np.diff([at_s for at_s, look in of_lidars if look.edge == "roof-short_left"]) / LIDAR_PERIOD_S
+def test_observations_of_two_lidars_come_in_their_time_and_scatter_as_those_on_streets() -> None:
+    received = simulate_checks(FULL, STILL, np.random.default_rng(4))
+    assert received == sorted(received, key=lambda one: one[0])
+    of_lidars = [(at_s, observation) for at_s, observation in received if observation.edge in FULL.graph.of_lidars]
+    assert all(at_s - observation.stamp_ns / NS_PER_S == pytest.approx(LIDAR_LATE_S) for at_s, observation in of_lidars)
+    spaced = (
+        np.diff([at_s for at_s, observation in of_lidars if observation.edge == "roof-short_left"]) / LIDAR_PERIOD_S
+    )
     np.testing.assert_allclose(spaced, np.round(spaced))
-    offsets = np.concatenate([scattered(heard, name) for name in sorted(FULL.graph.of_lidars)])
+    offsets = np.concatenate([scattered(received, name) for name in sorted(FULL.graph.of_lidars)])
     middle = np.median(np.abs(offsets), axis=0) / 0.6745  # of a normal variable, its standard deviation
     expected = np.hypot(LIDAR_CHECK, edge_observations.PLACE)
     assert ((middle > 0.6 * expected) & (middle < 1.5 * expected)).all()
     assert np.abs(offsets).max() > 20.0 * expected.max(), "some are bad"
 
 
-def test_a_rig_whose_lidars_are_not_looked_at_has_no_such_looks() -> None:
+def test_a_rig_whose_lidars_are_not_checked_has_no_such_observations() -> None:
     assert not UNLINKED.graph.of_lidars
-    seen = Counter(look.edge for _, look in simulate_checks(UNLINKED, STILL, np.random.default_rng(4)))
+    seen = Counter(observation.edge for _, observation in simulate_checks(UNLINKED, STILL, np.random.default_rng(4)))
     assert set(seen) <= set(UNLINKED.graph.edge)
 
 
@@ -59,8 +63,8 @@ def test_what_lasts_is_in_every_window_of_a_rig() -> None:
     lasting = Lasting.of(FULL, rng)
     offsets = []
     for _ in range(60):
-        told = windows(FULL, FULL.poses, lasting, rng)
-        offsets.append([se3.difference(told[n].T_camera_lidar, FULL.graph.edge[n].T_a_b) for n in lasting.between])
+        reported = windows(FULL, FULL.poses, lasting, rng)
+        offsets.append([se3.difference(reported[n].T_camera_lidar, FULL.graph.edge[n].T_a_b) for n in lasting.between])
     mean = np.mean(offsets, axis=0)
     for place, name in enumerate(lasting.between):
         np.testing.assert_allclose(mean[place], lasting.between[name], atol=5.0 * LIDAR_CHECK.max() / np.sqrt(60.0))

@@ -60,7 +60,7 @@ def test_the_place_is_where_the_two_differ() -> None:
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_the_image_tells_which_is_right(sign: float) -> None:
+def test_the_image_reports_which_is_right(sign: float) -> None:
     window = scenes.post_window((-10.0, 0.0, 12.0))
     truth = window.T_camera_lidar_start
     wrong = _turned(truth, (0.0, 1.0, 0.0), 0.5 * sign)
@@ -70,48 +70,52 @@ def test_the_image_tells_which_is_right(sign: float) -> None:
     assert turned.strength == pytest.approx(seen.strength[::-1])
 
 
-def test_places_lie_in_the_image_and_apart() -> None:
+def test_places_lie_in_the_image_and_separate() -> None:
     window = scenes.post_window((-36.0, -20.0, -18.0, 0.0, 3.0, 37.0))
-    found = _places(
+    result = _places(
         window, _turned(window.T_camera_lidar_start, (0.0, 1.0, 0.0), 0.3), window.T_camera_lidar_start
     ).regions
-    assert len(found) == 3
-    for place in found:
+    assert len(result) == 3
+    for place in result:
         part = place.part
         assert part.left >= 0
         assert part.top >= 0
         assert part.left + part.width <= scenes.POST_CAMERA.width
         assert part.top + part.height <= scenes.POST_CAMERA.height
-        apart = [max(abs(part.left - other.part.left) / 90, abs(part.top - other.part.top) / 60) for other in found]
-        assert sorted(apart)[1] > 0.4  # their outlines are others; the rectangles are moved to the middle of theirs
+        separation = [
+            max(abs(part.left - other.part.left) / 90, abs(part.top - other.part.top) / 60) for other in result
+        ]
+        assert (
+            sorted(separation)[1] > 0.4
+        )  # their outlines are others; the rectangles are moved to the middle of theirs
 
 
 def test_masked_outlines_are_no_place() -> None:
     mask = np.ones((360, 640), np.bool_)
     mask[:, 320:] = False  # the post on the right
     window = scenes.post_window((-18.0, 18.0), mask=mask)
-    found = _places(
+    result = _places(
         window, _turned(window.T_camera_lidar_start, (0.0, 1.0, 0.0), 0.3), window.T_camera_lidar_start
     ).regions
-    assert found
-    assert all(place.part.left < 320 for place in found)
+    assert result
+    assert all(place.part.left < 320 for place in result)
 
 
 def test_without_a_range_edge_there_is_no_place() -> None:
     window = scenes.post_window(())
-    found = _places(window, _turned(window.T_camera_lidar_start, (0.0, 1.0, 0.0), 0.3), window.T_camera_lidar_start)
-    assert found.regions == ()
-    assert np.isnan(found.strength).all()
+    result = _places(window, _turned(window.T_camera_lidar_start, (0.0, 1.0, 0.0), 0.3), window.T_camera_lidar_start)
+    assert result.regions == ()
+    assert np.isnan(result.strength).all()
     assert shift_px(window, window.T_camera_lidar_start, window.T_camera_lidar_start, compensated=True) is None
 
 
 def test_the_shift_of_a_turn_is_its_angle_in_pixels() -> None:
     window = scenes.post_window((0.0,))
     one = window.T_camera_lidar_start
-    told = shift_px(window, one, _turned(one, (0.0, 1.0, 0.0), 1.0), compensated=True)
-    assert told is not None
-    assert told.median_px == pytest.approx(400.0 * np.tan(radians(1.0)), rel=0.02)
-    assert told.largest_px < 1.1 * told.median_px
+    reported = shift_px(window, one, _turned(one, (0.0, 1.0, 0.0), 1.0), compensated=True)
+    assert reported is not None
+    assert reported.median_px == pytest.approx(400.0 * np.tan(radians(1.0)), rel=0.02)
+    assert reported.largest_px < 1.1 * reported.median_px
 
 
 def test_an_image_of_another_size_is_refused() -> None:

@@ -32,13 +32,13 @@ def test_one_frame_has_no_halves() -> None:
         split(1, 0)
 
 
-def _ended(*deg: float, sigma_deg: float = 0.1, accepted: bool = True) -> SolveOutcome:
+def _finished(*deg: float, sigma_deg: float = 0.1, accepted: bool = True) -> SolveOutcome:
     estimate = _estimate(_xi(*deg), accepted, radians(sigma_deg))
     return score(Trial(FAR, estimate, 1.0), REFERENCE, 3)
 
 
 def test_differences_and_their_cover_are_per_axis() -> None:
-    halves = compare([(_ended(0.1, 0.0), _ended(-0.1, 0.5)), (_ended(0.0, 0.1), _ended(0.1, 0.1))], 5, 3)
+    halves = compare([(_finished(0.1, 0.0), _finished(-0.1, 0.5)), (_finished(0.0, 0.1), _finished(0.1, 0.1))], 5, 3)
     assert (halves.splits, halves.pairs, halves.solved, halves.accepted) == (2, 5, 2, 2)
     np.testing.assert_allclose(np.degrees(halves.rms[:3]), [np.sqrt(0.025), np.sqrt(0.125), 0.0], atol=2e-3)
     np.testing.assert_allclose(np.degrees(halves.largest[:3]), [0.2, 0.5, 0.0], atol=2e-3)
@@ -49,15 +49,15 @@ def test_differences_and_their_cover_are_per_axis() -> None:
 
 
 def test_halves_that_claim_nothing_cover_nothing() -> None:
-    halves = compare([(_ended(0.1, sigma_deg=np.nan), _ended(0.1))], 2, 3)
+    halves = compare([(_finished(0.1, sigma_deg=np.nan), _finished(0.1))], 2, 3)
     assert halves.claimed.tolist() == [0] * 6
     assert np.isnan(halves.covered).all()
     assert np.isnan(halves.sigma).all()
 
 
 def test_what_was_not_solved_or_not_accepted_is_counted() -> None:
-    lost = replace(_ended(0.0), trial=Trial(FAR, None, 1.0), accepted=False)
-    halves = compare([(lost, _ended(0.1)), (_ended(0.1), _ended(0.2, accepted=False))], 5, 3)
+    lost = replace(_finished(0.0), trial=Trial(FAR, None, 1.0), accepted=False)
+    halves = compare([(lost, _finished(0.1)), (_finished(0.1), _finished(0.2, accepted=False))], 5, 3)
     assert (halves.splits, halves.solved, halves.accepted, halves.hits) == (2, 1, 0, 1)
     nothing = compare([(lost, lost)], 5, 3)
     assert nothing.solved == 0
@@ -66,7 +66,7 @@ def test_what_was_not_solved_or_not_accepted_is_counted() -> None:
 
 def test_three_sigma_cover_normal_noise() -> None:
     rng = np.random.default_rng(3)
-    pairs = [(_ended(*rng.normal(0, 0.1, 3)), _ended(*rng.normal(0, 0.1, 3))) for _ in range(200)]
+    pairs = [(_finished(*rng.normal(0, 0.1, 3)), _finished(*rng.normal(0, 0.1, 3))) for _ in range(200)]
     halves = compare(pairs, 5, 3)
     assert (halves.covered[:3] > 0.98).all()
     np.testing.assert_allclose(halves.rms[:3], halves.sigma[:3], rtol=0.2)

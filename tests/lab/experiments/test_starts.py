@@ -58,12 +58,12 @@ def test_partners_are_a_permutation(count: int) -> None:
 
 def test_partners_are_no_copy_and_neighbours_get_distant_ones() -> None:
     sphere = sphere_directions(200)
-    apart_rad = np.arccos(np.clip((sphere * sphere[translation_partners(200)]).sum(axis=1), -1.0, 1.0))
-    assert (apart_rad < radians(1.0)).mean() < 0.02
+    separation_rad = np.arccos(np.clip((sphere * sphere[translation_partners(200)]).sum(axis=1), -1.0, 1.0))
+    assert (separation_rad < radians(1.0)).mean() < 0.02
     assert abs(np.corrcoef(sphere[:, 2], sphere[translation_partners(200), 2])[0, 1]) < 0.2
 
 
-def test_perturbations_have_the_radii_that_were_asked_for() -> None:
+def test_perturbations_have_the_radii_that_were_requested() -> None:
     xi = perturbations(50, 0.2, 0.5)
     np.testing.assert_allclose(np.linalg.norm(xi[:, :3], axis=1), 0.2)
     np.testing.assert_allclose(np.linalg.norm(xi[:, 3:], axis=1), 0.5)
@@ -85,8 +85,8 @@ def test_frame_counts_end_with_all(available: int, counts: list[int]) -> None:
 
 
 def test_subsets_differ_by_trial_and_are_the_same_every_time() -> None:
-    drawn = [frame_subset(10, 3, trial) for trial in range(20)]
-    assert drawn == [frame_subset(10, 3, trial) for trial in range(20)]
-    assert len({tuple(one) for one in drawn}) > 10
-    assert all(one == sorted(set(one)) and set(one) <= set(range(10)) for one in drawn)
+    rendered = [frame_subset(10, 3, trial) for trial in range(20)]
+    assert rendered == [frame_subset(10, 3, trial) for trial in range(20)]
+    assert len({tuple(one) for one in rendered}) > 10
+    assert all(one == sorted(set(one)) and set(one) <= set(range(10)) for one in rendered)
     assert frame_subset(4, 4, 0) == [0, 1, 2, 3]

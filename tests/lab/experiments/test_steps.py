@@ -59,8 +59,8 @@ class Solver:
 
     def __call__(self, window: Window, *_: object) -> Estimate:
         self.windows.append(window)
-        told: Estimate = self.says(window)
-        return told
+        reported: Estimate = self.says(window)
+        return reported
 
 
 def at(window: Window, off_deg: float, sigma_deg: float = 0.01) -> Estimate:
@@ -89,13 +89,13 @@ def tried(
 def test_late_sweeps_are_as_if_the_mount_had_moved(street: Window, monkeypatch: pytest.MonkeyPatch) -> None:
     solver = Solver(lambda window: at(window, 0.0))
     tried(monkeypatch, street, solver, MountStep("none", 0.0), MountStep("2 deg", radians(2.0)), trials=4)
-    still, *knocked = solver.windows
+    still, *displaced = solver.windows
     T = street.T_camera_lidar_start
     for before, pair in zip(street.pairs, still.pairs, strict=True):
         expected = compensate(before, street.rig, enabled=True)
         np.testing.assert_allclose(pair.lidar.xyz_m, expected, atol=1e-4)
     places = set()
-    for window in knocked:
+    for window in displaced:
         carried = []
         for one, other in zip(still.pairs, window.pairs, strict=True):
             # Where the camera sees a point before and after tells by how much it was turned.
@@ -114,31 +114,33 @@ def test_late_sweeps_are_as_if_the_mount_had_moved(street: Window, monkeypatch: 
 def test_what_is_accepted_elsewhere_than_at_the_end_is_wrong(street: Window, monkeypatch: pytest.MonkeyPatch) -> None:
     for sigma_deg, wrong in ((0.01, True), (0.6, False)):
         solver = Solver(lambda window, sigma_deg=sigma_deg: at(window, 0.0, sigma_deg))
-        told = tried(monkeypatch, street, solver, MountStep("none", 0.0), MountStep("2 deg", radians(2.0)))
-        assert [one.wrong for one in told] == [False, wrong, wrong, wrong]
+        reported = tried(monkeypatch, street, solver, MountStep("none", 0.0), MountStep("2 deg", radians(2.0)))
+        assert [one.wrong for one in reported] == [False, wrong, wrong, wrong]
 
 
 def test_the_time_of_a_step_is_known_where_its_place_is(street: Window, monkeypatch: pytest.MonkeyPatch) -> None:
     knock = MountStep("1 deg", radians(1.0))
     solver = Solver(lambda window: refused(window, 1))
-    told = tried(monkeypatch, street, solver, knock, trials=12)
+    reported = tried(monkeypatch, street, solver, knock, trials=12)
     spacing_s = (street.pairs[1].stamp_ns - street.pairs[0].stamp_ns) / 1e9
-    for one in told:
+    for one in reported:
         first_late = round((1.0 - one.late) * len(street.pairs))
         assert one.off_s is not None
         assert abs(one.off_s - (first_late - 1) * spacing_s) <= spacing_s / 2 + 1e-6
-    (row,) = mount_steps.table(told)
-    assert row.time_known == np.mean([one.off_s is not None and one.off_s <= mount_steps.KNOWN_TO_S for one in told])
+    (row,) = mount_steps.table(reported)
+    assert row.time_known == np.mean(
+        [one.off_s is not None and one.off_s <= mount_steps.KNOWN_TO_S for one in reported]
+    )
 
 
 def test_the_table_has_a_row_for_each_knock_in_their_order() -> None:
-    def one(name: str, **told: Any) -> MountStepTrial:
+    def one(name: str, **reported: Any) -> MountStepTrial:
         plain = {"accepted": False, "wrong": False, "moved": False, "off_s": None, "interval_s": None, "holds": None}
-        return MountStepTrial(name, **{**plain, "late": 0.5, **told})
+        return MountStepTrial(name, **{**plain, "late": 0.5, **reported})
 
-    told = [one("none", accepted=True), one("1 deg", moved=True, off_s=1.0, interval_s=2.5, holds=True)]
-    told += [one("1 deg", accepted=True, wrong=True), one("1 deg, slowly", moved=True)]
-    assert mount_steps.table(told) == (
+    reported = [one("none", accepted=True), one("1 deg", moved=True, off_s=1.0, interval_s=2.5, holds=True)]
+    reported += [one("1 deg", accepted=True, wrong=True), one("1 deg, slowly", moved=True)]
+    assert mount_steps.table(reported) == (
         MountStepRow("none", 1, 1.0, 0.0, 0.0, None, None, None, None),
         MountStepRow("1 deg", 2, 0.5, 0.5, 0.5, 0.5, 1.0, 2.5, 1.0),
         MountStepRow("1 deg, slowly", 1, 0.0, 0.0, 1.0, None, None, None, None),

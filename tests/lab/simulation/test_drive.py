@@ -35,8 +35,8 @@ pytestmark = pytest.mark.usefixtures("streets")
 
 def small(*faults: str, seconds: float = 1.0, depth: bool = False, **more: object) -> SimulatedDrive:
     config = {"seed": 4, "camera": "fisheye128", "lidar": "16", "camera_hz": 5.0, "lidar_hz": 5.0} | more
-    chosen = tuple(parse_fault(text) for text in faults)
-    return SimulatedDrive(DriveConfig(seconds=seconds, faults=chosen, depth=depth, **config))  # type: ignore[arg-type]
+    selected = tuple(parse_fault(text) for text in faults)
+    return SimulatedDrive(DriveConfig(seconds=seconds, faults=selected, depth=depth, **config))  # type: ignore[arg-type]
 
 
 @lru_cache(maxsize=1)
@@ -79,11 +79,11 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(streets: Str
     assert not [entry for entry in other if entry in whole]
 
 
-def test_another_lens_sees_the_same_drive_as_one_drawn_for_it_alone() -> None:
+def test_another_lens_sees_the_same_drive_as_one_rendered_for_it_alone() -> None:
     first, alone = small(seconds=0.3), small(seconds=0.3, camera="pinhole160x120@60", half_view_deg=50.0)
     through = first.through("pinhole160x120@60", 50.0)
-    drawn = [(message, through.part(number, number + 1)[0]) for number, message in enumerate(first.messages())]
-    seen = [other if isinstance(one, CameraFrame) else one for one, other in drawn]
+    rendered = [(message, through.part(number, number + 1)[0]) for number, message in enumerate(first.messages())]
+    seen = [other if isinstance(one, CameraFrame) else one for one, other in rendered]
     assert fingerprint(seen) == fingerprint(alone.messages())
     assert first.rig.camera.width == 128
     assert through.rig.camera == alone.rig.camera
@@ -96,7 +96,7 @@ def test_several_processes_give_the_same_bytes_in_the_same_order() -> None:
     assert fingerprint(messages_by(config, 2)) == fingerprint(SimulatedDrive(config).messages())
 
 
-def test_nothing_more_is_drawn_when_nobody_waits_for_it() -> None:
+def test_nothing_more_is_rendered_when_nobody_waits_for_it() -> None:
     config, left = small(seconds=0.3).config, multiprocessing.get_context("spawn").Event()
     parallel._open(config, left)
     whole = SimulatedDrive(config).messages()
@@ -105,7 +105,7 @@ def test_nothing_more_is_drawn_when_nobody_waits_for_it() -> None:
     assert parallel._part(0) == []
 
 
-def test_chosen_frames_are_those_of_the_whole_drive() -> None:
+def test_selected_frames_are_those_of_the_whole_drive() -> None:
     whole = fingerprint(plain())
     part = list(small().messages([2]))
     assert [frame.sequence for frame in pictures(part)] == [2]
@@ -130,13 +130,13 @@ def share_consistent(drive: SimulatedDrive, pair: FramePair, *, compensated: boo
     T = drive.truth(pair.camera.stamp_ns)
     p_camera = xyz @ T[:3, :3].T + T[:3, 3]
     uv, valid = project(drive.camera, p_camera)
-    kept = valid & in_image(drive.camera, uv)
-    u, v = np.rint(uv[kept]).astype(int).T
+    retained = valid & in_image(drive.camera, uv)
+    u, v = np.rint(uv[retained]).astype(int).T
     assert pair.camera.depth is not None
     assert drive.rig.mask is not None
     code = decode_depth(pair.camera.depth, LimitsConfig())[v, u].astype(np.float64)
     used = (code > 1) & drive.rig.mask[v, u]
-    error = np.linalg.norm(p_camera[kept][used], axis=1) - 65535 * NEAREST_M / code[used]
+    error = np.linalg.norm(p_camera[retained][used], axis=1) - 65535 * NEAREST_M / code[used]
     assert used.sum() > 1000
     return float((np.abs(error) < 0.1 + 0.02 * np.abs(65535 * NEAREST_M / code[used])).mean())
 
@@ -167,19 +167,19 @@ def test_the_twist_leads_from_one_pose_to_the_next() -> None:
 
 def test_the_truth_follows_the_faults_and_the_rig_knows_nothing_of_them() -> None:
     drive = small("step:10:rx=3", "drift:20-30:tz=0.1", workshop=(0.0, 2.0, 0.0, 0.0, 0.0, 0.0))
-    start, knocked, crept = (drive.truth(START_NS + round(t * 1e9)) for t in (0.0, 15.0, 40.0))
-    np.testing.assert_allclose(np.rad2deg(difference(knocked, start)[:3]), [3, 0, 0], atol=1e-9)
-    np.testing.assert_allclose(difference(crept, knocked), [0, 0, 0, 0, 0, 0.1], atol=1e-9)
+    start, displaced, crept = (drive.truth(START_NS + round(t * 1e9)) for t in (0.0, 15.0, 40.0))
+    np.testing.assert_allclose(np.rad2deg(difference(displaced, start)[:3]), [3, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(difference(crept, displaced), [0, 0, 0, 0, 0, 0.1], atol=1e-9)
     nominal = difference(drive.rig.T_camera_lidar_nominal, start)
     np.testing.assert_allclose(np.rad2deg(nominal[:3]), [0, 2, 0], atol=1e-9)
     assert np.array_equal(drive.T_camera_lidar_start, drive.rig.T_camera_lidar_nominal)
 
 
-def test_a_knocked_camera_sees_something_else_from_then_on() -> None:
-    knocked = tuple(small("step:0.5:rx=3").messages())
-    same = [a.image == b.image for a, b in zip(pictures(plain()), pictures(knocked), strict=True)]
+def test_a_displaced_camera_sees_something_else_from_then_on() -> None:
+    displaced = tuple(small("step:0.5:rx=3").messages())
+    same = [a.image == b.image for a, b in zip(pictures(plain()), pictures(displaced), strict=True)]
     assert same == [True, True, True, False, False]
-    assert all(np.array_equal(a.xyz_m, b.xyz_m) for a, b in zip(sweeps(plain()), sweeps(knocked), strict=True))
+    assert all(np.array_equal(a.xyz_m, b.xyz_m) for a, b in zip(sweeps(plain()), sweeps(displaced), strict=True))
 
 
 def test_dirt_blurs_and_darkness_is_dark() -> None:

@@ -32,12 +32,12 @@ from coec_lab.simulation.faults import parse_fault, shifted
         ("night:1-2", faults.Night(1, 2)),
     ],
 )
-def test_the_words_of_a_fault(text: str, expected: faults.Fault) -> None:
+def test_the_text_of_a_fault(text: str, expected: faults.Fault) -> None:
     assert parse_fault(text) == expected
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "reported"),
     [
         ("rust:3", "unknown fault 'rust'"),
         ("step", "begin must be a number, not ''"),
@@ -54,10 +54,10 @@ def test_the_words_of_a_fault(text: str, expected: faults.Fault) -> None:
         ("swing:1:rx=1,period_s=0", "period_s must be 0.01 or more"),
     ],
 )
-def test_what_does_not_fit_is_refused_with_an_example(text: str, said: str) -> None:
+def test_what_does_not_fit_is_refused_with_an_example(text: str, reported: str) -> None:
     with pytest.raises(UsageError, match=r"step:30:rx=3|between 0 and 1|drift:30-90|or more") as refused:
         parse_fault(text)
-    assert said in str(refused.value)
+    assert reported in str(refused.value)
 
 
 def test_every_example_of_the_help_is_understood() -> None:

@@ -29,13 +29,13 @@ def at_20_s(*faults: str) -> tuple[NDArray[np.int64], LidarFrame]:
 
 def test_a_span_lies_where_the_vehicle_then_is() -> None:
     pace = Pace(100.0, 0.5, 8.5)
-    found = passages((parse_fault("tunnel:5-9"), parse_fault("open_road:20")), pace, 30.0)
-    ((tunnel,), (bare,)) = found.tunnels, found.open
+    result = passages((parse_fault("tunnel:5-9"), parse_fault("open_road:20")), pace, 30.0)
+    ((tunnel,), (bare,)) = result.tunnels, result.open
     at_5, at_9, at_20, at_30 = pace.progress(np.array([5.0, 9.0, 20.0, 30.0]))
     assert (tunnel.begin_m, tunnel.end_m) == (at_5, at_9)
     assert bare.begin_m == at_20
     assert bare.end_m > at_30
-    assert found.cleared() == (bare.widened(CLEAR_M),)
+    assert result.cleared() == (bare.widened(CLEAR_M),)
     assert tunnel.part(at_5 - 10, at_5 + 1) == RoadSpan(at_5, at_5 + 1)
     assert tunnel.part(at_9, at_9 + 1) is None
 
@@ -44,8 +44,8 @@ def test_a_tunnel_is_near_dim_and_bare() -> None:
     street, _ = at_20_s("dirt:0-1")
     picture, sweep = at_20_s("tunnel:10-30")
     style = sample_style(4)
-    beside = np.abs(sweep.xyz_m[np.abs(sweep.xyz_m[:, 0]) < 8.0][:, 1])
-    assert beside.max() < 2 * style.lane_m + VERGE_M
+    neighbour = np.abs(sweep.xyz_m[np.abs(sweep.xyz_m[:, 0]) < 8.0][:, 1])
+    assert neighbour.max() < 2 * style.lane_m + VERGE_M
     above = sweep.xyz_m[:, 2][np.linalg.norm(sweep.xyz_m, axis=1) < 20.0]
     assert HIGH_M - P_EGO_LIDAR_M[2] - 0.4 < above.max() < HIGH_M - P_EGO_LIDAR_M[2] + 0.4
     assert picture.mean() < 0.7 * street.mean()

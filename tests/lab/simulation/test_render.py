@@ -62,12 +62,12 @@ def test_what_stands_in_the_sun_throws_a_shadow() -> None:
     bright = render_view(a_scene(floor), PINHOLE, looking_ahead(1.5)).bgr
     shaded = render_view(a_scene(join([floor, roof])), PINHOLE, looking_ahead(1.5)).bgr
     under = (20 + round(40 * 1.5 / 6.0), 30)  # the floor 6 m ahead
-    beside = (20 + round(40 * 1.5 / 6.0), 30 + round(40 * 3.0 / 6.0))
+    neighbour = (20 + round(40 * 1.5 / 6.0), 30 + round(40 * 3.0 / 6.0))
     assert shaded[under].mean() < 0.7 * bright[under].mean()
-    assert np.abs(shaded[beside].astype(int) - bright[beside]).max() <= 2
+    assert np.abs(shaded[neighbour].astype(int) - bright[neighbour]).max() <= 2
 
 
-def test_the_sky_has_no_range_and_outside_the_lens_is_black() -> None:
+def test_the_sky_has_no_range_and_beyond_the_lens_is_black() -> None:
     floor = quads([[-50, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0]], (0.4, 0.4, 0.4), Material.PAINT)
     view = render_view(a_scene(floor), FISHEYE, looking_ahead(1.5), half_view_rad=np.deg2rad(92.5))
     assert np.isnan(view.range_m[:40]).all()

@@ -29,11 +29,11 @@ from coec_lab.simulation.vehicle_motion import whole_body
 
 pytestmark = pytest.mark.usefixtures("streets")
 
-WORDS = "rig=four-fisheyes&seed=4&seconds=0.5&camera=fisheye128&camera_hz=2&lidar_hz=2&ego_hz=20"
+TEXT = "rig=four-fisheyes&seed=4&seconds=0.5&camera=fisheye128&camera_hz=2&lidar_hz=2&ego_hz=20"
 
 
 def drive(*faults: str, **more: str) -> RigDrive:
-    query = dict(word.split("=") for word in WORDS.split("&")) | more
+    query = dict(word.split("=") for word in TEXT.split("&")) | more
     return open_rig(query | ({"faults": ";".join(faults)} if faults else {}))
 
 
@@ -67,7 +67,7 @@ def test_every_sensor_speaks_at_its_own_stamps() -> None:
 
 
 def test_a_pair_has_the_frames_of_the_rig_and_draws_no_others() -> None:
-    pair = open_source(f"sim:{WORDS}&pair=left-near_left")
+    pair = open_source(f"sim:{TEXT}&pair=left-near_left")
     assert isinstance(pair, HasGroundTruth)
     assert pair.rig.pair == "left-near_left"
     ours = [content(message) for message in pair.messages()]
@@ -97,33 +97,35 @@ def test_points_of_a_lidar_project_onto_the_depth_of_a_camera(camera: str, lidar
     T = pair.truth(eye.stamp_ns)
     p_camera = xyz @ T[:3, :3].T + T[:3, 3]
     uv, valid = project(pair.rig.camera, p_camera)
-    kept = valid & in_image(pair.rig.camera, uv)
-    u, v = np.rint(uv[kept]).astype(int).T
+    retained = valid & in_image(pair.rig.camera, uv)
+    u, v = np.rint(uv[retained]).astype(int).T
     assert eye.depth is not None
     assert pair.rig.mask is not None
     code = decode_depth(eye.depth, LimitsConfig())[v, u].astype(np.float64)
     used = (code > 1) & pair.rig.mask[v, u]
     range_m = 65535 * NEAREST_M / code[used]
-    error = np.abs(np.linalg.norm(p_camera[kept][used], axis=1) - range_m)
+    error = np.abs(np.linalg.norm(p_camera[retained][used], axis=1) - range_m)
     assert used.sum() > 1000
     # A pixel is more than a degree wide, and things hide behind others from one place and not from the other.
     assert (error < 0.15 + 0.05 * range_m).mean() > 0.75
 
 
 def test_a_fault_belongs_to_its_sensor_and_turns_it_about_its_own_axes() -> None:
-    knocked = drive("front:step:0:ry=3", "near_left:step:0:rz=2", "right:dark:0", "roof:beams:0:share=0.5", depth="yes")
-    after = by_sensor(list(knocked.messages()))
+    displaced = drive(
+        "front:step:0:ry=3", "near_left:step:0:rz=2", "right:dark:0", "roof:beams:0:share=0.5", depth="yes"
+    )
+    after = by_sensor(list(displaced.messages()))
     before = by_sensor(plain())
     changed = {name for name in before if content(before[name]) != content(after[name])}
     assert changed == {"front", "near_left", "right", "roof"}
     stamp_ns = START_NS + 100_000_000
     for sensor, expected in (("front", (0, 3, 0)), ("near_left", (0, 0, 2)), ("rear", (0, 0, 0))):
-        xi = difference(knocked.T_sensor_ego(sensor, stamp_ns), knocked.T_sensor_ego_nominal(sensor))
+        xi = difference(displaced.T_sensor_ego(sensor, stamp_ns), displaced.T_sensor_ego_nominal(sensor))
         np.testing.assert_allclose(np.rad2deg(xi[:3]), expected, atol=1e-9)
     moved = {
         (camera, lidar): np.rad2deg(np.linalg.norm(difference(pair.truth(stamp_ns), pair.T_camera_lidar_start)[:3]))
         for camera, lidar in (("front", "roof"), ("front", "near_left"), ("rear", "near_left"), ("rear", "roof"))
-        for pair in (knocked.pair(camera, lidar),)
+        for pair in (displaced.pair(camera, lidar),)
     }
     assert moved["front", "roof"] == pytest.approx(3.0)
     assert moved["rear", "near_left"] == pytest.approx(2.0)
@@ -131,10 +133,10 @@ def test_a_fault_belongs_to_its_sensor_and_turns_it_about_its_own_axes() -> None
     assert moved["front", "near_left"] > 3.0
 
 
-def test_a_knocked_lidar_measures_the_same_world_from_its_new_pose() -> None:
+def test_a_displaced_lidar_measures_the_same_world_from_its_new_pose() -> None:
     """With its true pose the points lie where they did, with the nominal one they do not."""
-    knocked = drive("roof:step:0:rx=4")
-    cloud, still = (by_sensor(list(messages))["roof"] for messages in (knocked.messages(), plain()))
+    displaced = drive("roof:step:0:rx=4")
+    cloud, still = (by_sensor(list(messages))["roof"] for messages in (displaced.messages(), plain()))
     assert isinstance(cloud, LidarFrame)
     assert isinstance(still, LidarFrame)
 
@@ -149,8 +151,8 @@ def test_a_knocked_lidar_measures_the_same_world_from_its_new_pose() -> None:
         return float(np.subtract(*np.percentile(heights(frame, T), [75, 25])))
 
     flat = spread(still, drive().T_sensor_ego("roof", still.stamp_ns))
-    assert spread(cloud, knocked.T_sensor_ego("roof", cloud.stamp_ns)) < flat + 0.05
-    assert spread(cloud, knocked.T_sensor_ego_nominal("roof")) > flat + 0.1
+    assert spread(cloud, displaced.T_sensor_ego("roof", cloud.stamp_ns)) < flat + 0.05
+    assert spread(cloud, displaced.T_sensor_ego_nominal("roof")) > flat + 0.1
 
 
 def test_the_workshop_may_be_wrong_about_a_sensor() -> None:
@@ -186,7 +188,7 @@ def test_no_sensor_sits_within_the_body_and_none_measures_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("text", "reported"),
     [
         ("rig=five", "choose one of four-fisheyes"),
         ("rig=four-fisheyes", "one pair of the rig is a recording: write pair="),
@@ -204,18 +206,18 @@ def test_no_sensor_sits_within_the_body_and_none_measures_it() -> None:
         ("rig=four-fisheyes&pair=front-roof&scene=moon", "choose one of street"),
     ],
 )
-def test_what_does_not_fit_is_refused(words: str, said: str) -> None:
-    with pytest.raises(UsageError, match=said):
-        open_source(f"sim:{words}")
+def test_what_does_not_fit_is_refused(text: str, reported: str) -> None:
+    with pytest.raises(UsageError, match=reported):
+        open_source(f"sim:{text}")
 
 
-def test_loss_is_of_whom_it_is_said() -> None:
-    words = {"seconds": "10"}
-    of_all = Counter(entry.stream for entry in drive("loss:0:share=1", **words).plan)
+def test_loss_is_of_whom_it_is_reported() -> None:
+    text = {"seconds": "10"}
+    of_all = Counter(entry.stream for entry in drive("loss:0:share=1", **text).plan)
     assert not of_all
-    made = drive("rear:loss:0:share=1", "no-ego:0", **words)
-    heard = {stream for _, stream, _ in made.plan}
-    assert heard == {made.stream(name) for name in (*made.cameras, *made.lidars) if name != "rear"}
+    made = drive("rear:loss:0:share=1", "no-ego:0", **text)
+    received = {stream for _, stream, _ in made.plan}
+    assert received == {made.stream(name) for name in (*made.cameras, *made.lidars) if name != "rear"}
 
 
 def test_night_is_everywhere() -> None:
@@ -228,7 +230,7 @@ def test_night_is_everywhere() -> None:
         assert np.percentile(grey[seen], 40) < 60 < np.percentile(grey[seen], 99.5)
 
 
-def test_a_pair_is_a_recording_of_the_rig_that_it_was_asked_of() -> None:
+def test_a_pair_is_a_recording_of_the_rig_that_it_was_requested_of() -> None:
     made = drive("roof:step:0.2:rz=1")
     one, other = made.pair("front", "roof"), made.pair("right", "roof")
     assert isinstance(one, SimulatedRigPair)

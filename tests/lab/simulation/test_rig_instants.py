@@ -20,15 +20,15 @@ SMALL = RigDriveConfig(seed=4, seconds=3.0, camera="fisheye64", ego_hz=20.0)
 
 def test_every_camera_has_a_picture_of_its_own_within_half_a_turn_of_the_sweep() -> None:
     drive = RigDrive(SMALL)
-    found = instants(drive, "roof", 0.5)
-    assert len(found) == 6
-    assert np.diff([instant.sweep.stamp_ns for instant in found]).tolist() == [500_000_000] * 5
-    for instant in found:
+    result = instants(drive, "roof", 0.5)
+    assert len(result) == 6
+    assert np.diff([instant.sweep.stamp_ns for instant in result]).tolist() == [500_000_000] * 5
+    for instant in result:
         assert set(instant.pictures) == set(drive.cameras)
         for camera, entry in instant.pictures.items():
             assert entry.stream == drive.stream(camera)
             assert abs(entry.stamp_ns - instant.sweep.stamp_ns) <= 50_000_000
-    assert len({entry for instant in found for entry in instant.pictures.values()}) == 6 * 4
+    assert len({entry for instant in result for entry in instant.pictures.values()}) == 6 * 4
 
 
 def test_an_instant_that_lacks_a_picture_is_left_out() -> None:
@@ -52,7 +52,7 @@ def test_the_frames_of_an_instant_are_the_pair_that_the_service_makes_of_them() 
     assert pair_of(picture, drive.message(later.sweep), motions) is None, "a second apart"
 
 
-def test_rows_without_a_picture_are_black_and_masked_and_the_others_are_drawn() -> None:
+def test_rows_without_a_picture_are_black_and_masked_and_the_others_are_rendered() -> None:
     from coec.config import LimitsConfig
     from coec.io.images import GreyImages
 

@@ -20,7 +20,7 @@ def test_a_place_does_not_depend_on_the_way_there() -> None:
     assert not np.array_equal(straight.street.corners_m[:100], Town(6, 400.0).scene(100.0).street.corners_m[:100])
 
 
-def test_only_what_is_near_is_kept() -> None:
+def test_only_what_is_near_is_retained() -> None:
     town = Town(2, 2000.0)
     for at_m in (0.0, 20 * STRETCH_M):
         scene = town.scene(at_m)

@@ -10,7 +10,7 @@ from coec_lab.simulation import source
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "reported"),
     [
         ("sim:sead=1", "unknown query key sead"),
         ("sim:seed=x", "seed=x"),
@@ -32,9 +32,9 @@ from coec_lab.simulation import source
         ("sim:intrinsics_off=30", "20 at most"),
     ],
 )
-def test_what_does_not_fit_is_refused(text: str, said: str) -> None:
+def test_what_does_not_fit_is_refused(text: str, reported: str) -> None:
     pytest.importorskip("embreex", reason="needs the optional extra `sim`")
-    with pytest.raises(UsageError, match=said):
+    with pytest.raises(UsageError, match=reported):
         open_source(text)
 
 

@@ -28,8 +28,8 @@ def test_camera_and_lidar_see_the_same_place(scene: str, half_m: float | None, h
     assert share_consistent(drive, FramePair(exposed, turn, motion), compensated=True) > 0.85
     assert pixels(exposed).mean() > 15
     if half_m is not None and high_m is not None:  # walls and a ceiling
-        beside = np.abs(turn.xyz_m[np.abs(turn.xyz_m[:, 0]) < 4.0][:, 1])
-        assert beside.max() < half_m + 1.5
+        neighbour = np.abs(turn.xyz_m[np.abs(turn.xyz_m[:, 0]) < 4.0][:, 1])
+        assert neighbour.max() < half_m + 1.5
         assert turn.xyz_m[:, 2].max() + P_EGO_LIDAR_M[2] == pytest.approx(high_m, abs=0.35)
 
 
@@ -47,8 +47,8 @@ def test_a_standing_vehicle_sees_the_same_again_where_nothing_else_moves() -> No
     assert changed(still) < 1.3
     assert changed(peopled) > changed(still) + 0.2
     assert changed(driven) > 4.0
-    told = [message.speed_mps for message in still.messages([0]) if isinstance(message, EgoMotion)]
-    assert all(speed_mps is not None and speed_mps < 0.2 for speed_mps in told)
+    reported = [message.speed_mps for message in still.messages([0]) if isinstance(message, EgoMotion)]
+    assert all(speed_mps is not None and speed_mps < 0.2 for speed_mps in reported)
 
 
 def test_a_rolling_shutter_shears_the_picture_of_a_moving_camera_alone() -> None:
@@ -64,7 +64,7 @@ def test_a_rolling_shutter_shears_the_picture_of_a_moving_camera_alone() -> None
     np.testing.assert_array_equal(seen(0.1, 0.0), seen(0.0, 0.0))
 
 
-def test_wrong_intrinsics_are_told_and_not_seen() -> None:
+def test_wrong_intrinsics_are_reported_and_not_seen() -> None:
     right, wrong = (small(scene="highway", seconds=0.2, intrinsics_off=off) for off in ((0.0,) * 3, (2.0, 1.0, -1.0)))
     assert pictures(right.messages([0]))[0] == pictures(wrong.messages([0]))[0]
     ours, theirs = right.rig.camera, wrong.rig.camera

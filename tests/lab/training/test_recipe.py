@@ -49,7 +49,7 @@ def test_crowded_seeds_have_jams_and_halls_and_near_things_high_up() -> None:
 
 
 @pytest.mark.parametrize("kind", SHAPES)
-def test_drawn_cameras_see_all_that_they_should(kind: str) -> None:
+def test_rendered_cameras_see_all_that_they_should(kind: str) -> None:
     rng = np.random.default_rng(3)
     for _ in range(5):
         eye = recipe.sample_camera(kind, rng)
@@ -86,13 +86,13 @@ def test_augmented_frames_are_seeded_and_keep_picture_and_target_together() -> N
     code[:, 200:] = 6000
     bgr = np.where(code[:, :, None] > 3000, 220, 30).astype(np.uint8).repeat(3, axis=2)
     for seed in range(20):
-        rgb, wanted = augment(TrainingFrame("wide", bgr, code), 128, 224, np.random.default_rng(seed))
+        rgb, expected = augment(TrainingFrame("wide", bgr, code), 128, 224, np.random.default_rng(seed))
         again, _ = augment(TrainingFrame("wide", bgr, code), 128, 224, np.random.default_rng(seed))
         np.testing.assert_array_equal(rgb, again)
         assert rgb.shape == (128, 224, 3)
         assert rgb.dtype == np.float32
         assert rgb.min() >= 0
         assert rgb.max() <= 255
-        near = wanted > 0.2
+        near = expected > 0.2
         if near.any() and not near.all():
             assert rgb[near].mean() > rgb[~near].mean() + 20

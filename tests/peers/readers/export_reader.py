@@ -106,7 +106,7 @@ with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"export.{'yaml' if request['format'] == 'opencv' else request['format']}"
         file.write_text(request["text"])
         try:
-            told: dict[str, object] = {"T_child_parent": READERS[request["format"]](file).tolist()}
+            reported: dict[str, object] = {"T_child_parent": READERS[request["format"]](file).tolist()}
         except Exception as error:
-            told = {"error": f"{type(error).__name__}: {error}"}
-        print(json.dumps(told), flush=True)
+            reported = {"error": f"{type(error).__name__}: {error}"}
+        print(json.dumps(reported), flush=True)

@@ -31,7 +31,7 @@ DEPTH = 200
 writing = threading.Lock()
 
 
-def tell(head: dict[str, Any], payload: bytes = b"") -> None:
+def report(head: dict[str, Any], payload: bytes = b"") -> None:
     text = json.dumps({**head, "bytes": len(payload)}).encode()
     with writing:
         sys.stdout.buffer.write(struct.pack(">I", len(text)) + text + payload)
@@ -39,11 +39,11 @@ def tell(head: dict[str, Any], payload: bytes = b"") -> None:
 
 
 def received(topic: str, message: Any) -> None:
-    tell({"topic": topic}, bytes(serialize_message(message)))
+    report({"topic": topic}, bytes(serialize_message(message)))
 
 
 def matched(topic: str, info: Any) -> None:
-    tell({"matched": topic, "peers": info.current_count})
+    report({"matched": topic, "peers": info.current_count})
 
 
 def type_of(name: str) -> Any:
@@ -65,9 +65,9 @@ def frame(stream: BinaryIO) -> tuple[dict[str, Any], bytes] | None:
 
 
 def main() -> None:
-    told = json.loads(sys.argv[1])
+    reported = json.loads(sys.argv[1])
     rclpy.init()
-    node = rclpy.create_node(told["name"])
+    node = rclpy.create_node(reported["name"])
     publishers = {
         topic: node.create_publisher(
             type_of(one["type"]),
@@ -75,10 +75,10 @@ def main() -> None:
             qos_of(latched=one["latched"]),
             event_callbacks=PublisherEventCallbacks(matched=partial(matched, topic)),
         )
-        for topic, one in told["publish"].items()
+        for topic, one in reported["publish"].items()
     }
-    types = {topic: type_of(one["type"]) for topic, one in told["publish"].items()}
-    for topic, one in told["subscribe"].items():
+    types = {topic: type_of(one["type"]) for topic, one in reported["publish"].items()}
+    for topic, one in reported["subscribe"].items():
         node.create_subscription(
             type_of(one["type"]),
             topic,

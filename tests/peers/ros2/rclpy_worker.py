@@ -56,13 +56,13 @@ def answer(request: dict[str, Any]) -> dict[str, Any]:
     if request["do"] == "write":
         return {"cdr": serialize_message(fill(kind(), request["fields"])).hex()}
     description = Path(sys.prefix, "share", f"{request['type']}.json").read_text()
-    (found,) = (item for item in json.loads(description)["type_hashes"] if item["type_name"] == request["type"])
-    return {"hash": found["hash_string"]}
+    (result,) = (item for item in json.loads(description)["type_hashes"] if item["type_name"] == request["type"])
+    return {"hash": result["hash_string"]}
 
 
 for line in sys.stdin:
     try:
-        told = answer(json.loads(line))
+        reported = answer(json.loads(line))
     except Exception as error:
-        told = {"error": f"{type(error).__name__}: {error}"}
-    print(json.dumps(told), flush=True)
+        reported = {"error": f"{type(error).__name__}: {error}"}
+    print(json.dumps(reported), flush=True)

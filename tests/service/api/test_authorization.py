@@ -10,7 +10,7 @@ from coec.schemas.commands import COMMAND_NAMES
 from coec.service.api.authorization import Authority, NotAllowedError
 
 FILES = {"certificate": "v.pem", "private_key": "v-key.pem", "root_ca": "ca.pem"}
-OUTSIDE = "it connects to tcp/10.0.0.2:7447"
+CONTEXT = "it connects to tcp/10.0.0.2:7447"
 
 
 def config(**fields: object) -> AuthorityConfig:
@@ -31,8 +31,8 @@ def may(authority: Authority, name: str | None) -> set[str]:
 def test_a_sender_may_give_his_commands_and_no_other() -> None:
     senders = [{"name": "operator", "commands": ["hold", "reset"]}, {"name": "fleet"}]
     authority = Authority(config(senders=senders, anonymous="never"), lambda: None)
-    told = {name: may(authority, name) for name in ("operator", "fleet", "viewer", "Operator", "", None)}
-    assert told == {
+    reported = {name: may(authority, name) for name in ("operator", "fleet", "viewer", "Operator", "", None)}
+    assert reported == {
         "operator": {"hold", "reset"},
         "fleet": set(COMMAND_NAMES),
         "viewer": set(),
@@ -43,26 +43,26 @@ def test_a_sender_may_give_his_commands_and_no_other() -> None:
 
 
 @pytest.mark.parametrize(
-    ("anonymous", "outside", "allowed"),
+    ("anonymous", "context", "allowed"),
     [
         ("never", None, False),
         ("loopback", None, True),
-        ("loopback", OUTSIDE, False),
+        ("loopback", CONTEXT, False),
         ("always", None, True),
-        ("always", OUTSIDE, True),
+        ("always", CONTEXT, True),
     ],
 )
 def test_who_proves_no_name_may_give_commands_where_the_configuration_says_so(
-    anonymous: str, outside: str | None, allowed: bool
+    anonymous: str, context: str | None, allowed: bool
 ) -> None:
-    authority = Authority(AuthorityConfig.model_validate({"anonymous": anonymous}), lambda: outside)
+    authority = Authority(AuthorityConfig.model_validate({"anonymous": anonymous}), lambda: context)
     assert may(authority, None) == (set(COMMAND_NAMES) if allowed else set())
     assert not may(authority, "operator"), "a name that is not among the senders is worse than none"
 
 
-def test_a_router_is_looked_at_for_each_command() -> None:
-    said = [None, OUTSIDE, None]
-    authority = Authority(AuthorityConfig(), lambda: said.pop(0))
+def test_a_router_is_checked_for_each_command() -> None:
+    message = [None, CONTEXT, None]
+    authority = Authority(AuthorityConfig(), lambda: message.pop(0))
     authority.require(None, "hold")
     with pytest.raises(NotAllowedError, match=r"`hold` needs .* tcp/10\.0\.0\.2.*--zenoh FILE"):
         authority.require(None, "hold")

@@ -69,23 +69,23 @@ def vehicle(
 
 
 def plainly(session: zenoh.Session, payload: bytes | None = None, key: str = HOLD) -> dict[str, object]:
-    told: dict[str, object] = json.loads(query_one(session, f"{key}?format=json", PATIENCE_S, payload).payload)
-    return told
+    reported: dict[str, object] = json.loads(query_one(session, f"{key}?format=json", PATIENCE_S, payload).payload)
+    return reported
 
 
 def proven(
     session: zenoh.Session, authority: TestAuthority, name: str, key: str = HOLD, payload: bytes | None = None
 ) -> dict[str, object]:
     speaker = CommandSender(authority.credentials(name), "vehicle")
-    told: dict[str, object] = json.loads(
+    reported: dict[str, object] = json.loads(
         send_authenticated(session, f"{key}?format=json", payload, PATIENCE_S, speaker, JSON).payload
     )
-    return told
+    return reported
 
 
-def refusal(told: Callable[[], object]) -> tuple[str, str]:
+def refusal(reported: Callable[[], object]) -> tuple[str, str]:
     with pytest.raises(RemoteError) as refused:
-        told()
+        reported()
     return refused.value.reply_code, str(refused.value)
 
 
@@ -112,8 +112,8 @@ def test_who_proves_his_name_may_give_the_commands_that_are_his(
     authority: TestAuthority, router: zenoh.Session, vehicle: Served
 ) -> None:
     there = vehicle(authority.of_service(OPERATOR, SenderConfig(name="fleet")))
-    told = proven(router, authority, "operator")
-    assert (told["accepted"], told["code"]) == (True, "held")
+    reported = proven(router, authority, "operator")
+    assert (reported["accepted"], reported["code"]) == (True, "held")
     assert there.is_held
     assert proven(router, authority, "operator", payload=RELEASE)["code"] == "released"
     code, why = refusal(lambda: proven(router, authority, "operator", KEYS.command(PAIR, "reset")))
@@ -139,8 +139,8 @@ def test_a_proven_sender_is_not_held_up_by_those_who_are_not(
 ) -> None:
     monkeypatch.setattr(command_execution, "RateLimit", partial(RateLimit, clock=lambda: 0.0))
     there = vehicle(authority.of_service(OPERATOR, anonymous="always"))
-    told = [plainly(router)["code"] for _ in range(BURST + 2)]
-    assert told == ["held"] * BURST + ["too_many"] * 2
+    reported = [plainly(router)["code"] for _ in range(BURST + 2)]
+    assert reported == ["held"] * BURST + ["too_many"] * 2
     assert proven(router, authority, "operator", payload=RELEASE)["code"] == "released"
     assert not there.is_held
 
@@ -153,8 +153,8 @@ def test_what_was_meant_for_one_command_is_no_other(
     speaker = CommandSender(authority.credentials("operator"), "vehicle")
     reset = f"{KEYS.command(PAIR, 'reset')}?tls={'0' * 32};format=json"
     flight = query_one(router, reset, PATIENCE_S, speaker.first_flight()).payload
-    said = speaker.send(flight, to_json(ProvenCommand(selector=f"{HOLD}?format=json")))
-    code, why = refusal(lambda: query_one(router, reset, PATIENCE_S, said))
+    message = speaker.send(flight, to_json(ProvenCommand(selector=f"{HOLD}?format=json")))
+    code, why = refusal(lambda: query_one(router, reset, PATIENCE_S, message))
     assert (code, "not the requested command" in why) == ("bad_request", True)
     assert not there.bench.entries("command")
 
@@ -186,12 +186,12 @@ def test_a_service_without_a_certificate_says_so(
 def test_what_comes_through_a_door_for_everybody_is_denied(tmp_path: Path, door: str) -> None:
     port = free_port()
     wide = ZenohConfig(embedded_router=True, listen=(f"{door}:{port}",), insecure=True)
-    beside = ZenohConfig(connect=(f"tcp/127.0.0.1:{port}",))
-    with open_session(wide, VEHICLE_LIMITS) as open_router, serving(tmp_path / "beside", beside):
+    neighbour = ZenohConfig(connect=(f"tcp/127.0.0.1:{port}",))
+    with open_session(wide, VEHICLE_LIMITS) as open_router, serving(tmp_path / "beside", neighbour):
         wait_until(lambda: bool(list(open_router.get(KEYS.status, timeout=PATIENCE_S))), "the vehicle answers")
         code, why = refusal(lambda: plainly(open_router))
         assert (code, f"port {port} is open at" in why) == ("not_allowed", True)
-    with serving(tmp_path / "within", wide), open_session(beside, VEHICLE_LIMITS) as client:
+    with serving(tmp_path / "within", wide), open_session(neighbour, VEHICLE_LIMITS) as client:
         wait_until(lambda: bool(list(client.get(KEYS.status, timeout=PATIENCE_S))), "the vehicle answers")
         code, why = refusal(lambda: plainly(client))
         assert (code, "it listens at" in why) == ("not_allowed", True)
@@ -253,24 +253,24 @@ def test_beginnings_without_end_hold_up_no_proven_command(
 ) -> None:
     there = vehicle(authority.of_service(OPERATOR))
     hello = CommandSender(authority.credentials("viewer"), "vehicle").first_flight()
-    stop, ended, begun = threading.Event(), threading.Event(), [0]
+    stop, finished, started = threading.Event(), threading.Event(), [0]
 
     def flood() -> None:
         with connected([endpoint], PATIENCE_S) as session:
             while not stop.is_set():
                 conversations = (f"{HOLD}?tls={secrets.token_hex(16)}" for _ in range(64))
-                asked = [session.get(one, payload=hello, timeout=PATIENCE_S) for one in conversations]
-                begun[0] += sum(len(list(replies)) for replies in asked)
-        ended.set()
+                requested = [session.get(one, payload=hello, timeout=PATIENCE_S) for one in conversations]
+                started[0] += sum(len(list(replies)) for replies in requested)
+        finished.set()
 
     threading.Thread(target=flood).start()
-    wait_until(lambda: begun[0] > 200, "the flood")
+    wait_until(lambda: started[0] > 200, "the flood")
     times_s = []
     for payload in (None, RELEASE, None):
         began_s = time.monotonic()
         assert proven(router, authority, "operator", payload=payload)["accepted"]
         times_s.append(time.monotonic() - began_s)
     stop.set()
-    assert ended.wait(PATIENCE_S)
+    assert finished.wait(PATIENCE_S)
     assert there.is_held
-    record_property("figure", f"longest {max(times_s):.2f} s, beside {begun[0]} beginnings")
+    record_property("figure", f"longest {max(times_s):.2f} s, beside {started[0]} beginnings")

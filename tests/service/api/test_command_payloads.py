@@ -59,8 +59,8 @@ def test_what_is_no_command_is_refused_without_echo(name: str, payload: bytes) -
 @pytest.mark.fault("control characters and bombs as the name of a sender", "one harmless line in the log")
 @pytest.mark.fault("control characters and a novel as the reason of a command", "one line, or an error of ours")
 def test_a_reason_is_one_line_that_steers_no_terminal() -> None:
-    said = {"reason": " the mirror\nis \x1b[31mchanged\u202e, sagt Jürgen\x00 "}
-    for payload in (json.dumps(said).encode(), msgpack.packb(said)):
+    reported = {"reason": " the mirror\nis \x1b[31mchanged\u202e, sagt Jürgen\x00 "}
+    for payload in (json.dumps(reported).encode(), msgpack.packb(reported)):
         assert parse_payload("hold", payload) == {"reason": "the mirror is [31mchanged , sagt Jürgen"}
     assert parse_payload("reset", json.dumps({"reason": "ü" * MAX_REASON}).encode()) == {"reason": "ü" * MAX_REASON}
     assert parse_payload("reset", msgpack.packb({"reason": "€" * MAX_REASON})) == {"reason": "€" * MAX_REASON}
@@ -69,7 +69,7 @@ def test_a_reason_is_one_line_that_steers_no_terminal() -> None:
 
 
 @pytest.mark.parametrize(
-    ("attachment", "told"),
+    ("attachment", "report"),
     [
         (None, "anonymous"),
         (b"", "anonymous"),
@@ -77,8 +77,8 @@ def test_a_reason_is_one_line_that_steers_no_terminal() -> None:
         (b'eve\n{"level": "error"}\x1b[31m', "eve___level_: _error___[31m".replace("[", "_")),
     ],
 )
-def test_senders_are_one_harmless_line(attachment: bytes | None, told: str) -> None:
-    assert sender_of(attachment) == told
+def test_senders_are_one_harmless_line(attachment: bytes | None, report: str) -> None:
+    assert sender_of(attachment) == report
 
 
 def test_long_and_binary_senders_are_bounded() -> None:
@@ -96,7 +96,7 @@ def test_long_and_binary_senders_are_bounded() -> None:
         st.binary(max_size=16).map(lambda rest: b"{" + rest),
         st.binary(max_size=24).map(lambda rest: b"\x81\xa2to" + rest),
         st.dictionaries(st.text(max_size=3), st.integers() | st.text(max_size=3) | st.none(), max_size=3).map(
-            lambda told: json.dumps(told).encode()
+            lambda arguments: json.dumps(arguments).encode()
         ),
     ),
 )

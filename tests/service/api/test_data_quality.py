@@ -22,7 +22,7 @@ PAIR = PairConfig(
 LINE = "t: uint32, ns since the stamp; 0.0 to 99.9 ms, stamped at its begin"
 
 
-def test_how_points_are_timed_is_said() -> None:
+def test_how_points_are_timed_is_reported() -> None:
     assert data_quality_of(StreamStatistics(timed_by=LINE), {}).point_times == LINE
 
 
@@ -39,6 +39,6 @@ def test_what_motion_compensation_lacks_is_needed(compensation: dict[str, int], 
 
     needs = needs_of(report, PAIR, replace(estimate(1), compensation=compensation))
 
-    told = [one for one in needs if one.startswith("motion compensation")]
-    assert (need is None) == (not told)
-    assert need is None or need in told[0]
+    reported = [one for one in needs if one.startswith("motion compensation")]
+    assert (need is None) == (not reported)
+    assert need is None or need in reported[0]

@@ -50,9 +50,9 @@ def get(server: HttpServer, path: str, method: str = "GET") -> tuple[int, bytes]
     connection = http.client.HTTPConnection("127.0.0.1", port_of(server), timeout=PATIENCE_S)
     connection.request(method, path)
     answer = connection.getresponse()
-    told = answer.status, answer.read()
+    reported = answer.status, answer.read()
     connection.close()
-    return told
+    return reported
 
 
 def opened(server: HttpServer, sent: bytes = b"") -> socket.socket:
@@ -61,7 +61,7 @@ def opened(server: HttpServer, sent: bytes = b"") -> socket.socket:
     return made
 
 
-def test_a_page_is_answered_and_everything_else_is_not_found(server: HttpServer) -> None:
+def test_a_page_is_answered_and_everything_else_is_not_discovered(server: HttpServer) -> None:
     assert get(server, "/page") == (200, BODY)
     assert get(server, "/page?from=a-scraper") == (200, BODY)
     assert get(server, "/")[0] == get(server, "/page/")[0] == get(server, "/../page")[0] == 404
@@ -118,7 +118,7 @@ def test_what_the_reader_accepts_reaches_the_page(server: HttpServer, headers: b
         b"\x16\x03\x01\x02\x00\x01\r\n\r\n",
     ],
 )
-def test_what_is_no_request_is_told_so(server: HttpServer, request_: bytes) -> None:
+def test_an_invalid_request_is_reported(server: HttpServer, request_: bytes) -> None:
     with opened(server, request_) as client:
         assert client.recv(100).startswith(b"HTTP/1.1 400 ")
 
@@ -137,9 +137,9 @@ def test_slow_clients_keep_nobody_waiting(
 ) -> None:
     monkeypatch.setattr(served, "DEADLINE_S", 0.5)
     slow = [opened(server, b"GET /page HT") for _ in range(3 * MAX_CONNECTIONS)]
-    begun_s = time.monotonic()
+    started_s = time.monotonic()
     assert get(server, "/page") == (200, BODY)
-    record_property("figure", f"{1e3 * (time.monotonic() - begun_s):.0f} ms")
+    record_property("figure", f"{1e3 * (time.monotonic() - started_s):.0f} ms")
     assert len(server._connections) <= MAX_CONNECTIONS
     for client in slow:
         assert _ends(client)
@@ -160,11 +160,11 @@ def test_who_reads_nothing_is_dropped(server: HttpServer, monkeypatch: pytest.Mo
 
 def test_many_at_once_are_all_answered(server: HttpServer) -> None:
     with ThreadPoolExecutor(8) as pool:
-        told = list(pool.map(lambda _: get(server, "/page")[0], range(40)))
-    assert told == [200] * 40
+        reported = list(pool.map(lambda _: get(server, "/page")[0], range(40)))
+    assert reported == [200] * 40
 
 
-def test_a_port_that_is_taken_is_told() -> None:
+def test_a_port_that_is_taken_is_reported() -> None:
     with socket.create_server(("127.0.0.1", 0)) as other, pytest.raises(UnavailableError, match="cannot listen"):
         HttpServer("127.0.0.1", other.getsockname()[1], find)
 

@@ -32,30 +32,30 @@ class Clock:
         return self.now_s
 
 
-def test_it_is_said_on_change_from_time_to_time_and_at_the_end(tmp_path: Path) -> None:
+def test_it_is_reported_on_change_from_time_to_time_and_at_the_end(tmp_path: Path) -> None:
     bench, clock = PairBench(tmp_path / "state", vehicle="vehicle"), Clock()
-    said: list[tuple[str, Answer]] = []
-    words = Heartbeats(KEYS, "1.2", PERIOD, lambda key, answer: said.append((key, answer)), clock)
+    reported: list[tuple[str, Answer]] = []
+    text = Heartbeats(KEYS, "1.2", PERIOD, lambda key, answer: reported.append((key, answer)), clock)
 
-    def heard(service: str) -> list[str]:
-        before = len(said)
-        words.renew(service, "h", [bench.answers])  # type: ignore[arg-type]
-        return [last_word.decode_heartbeat(key, answer.payload).service for key, answer in said[before:]]
+    def received(service: str) -> list[str]:
+        before = len(reported)
+        text.renew(service, "h", [bench.answers])  # type: ignore[arg-type]
+        return [last_word.decode_heartbeat(key, answer.payload).service for key, answer in reported[before:]]
 
-    assert heard("running") == ["running"]
-    assert heard("running") == [], "nothing has changed"
+    assert received("running") == ["running"]
+    assert received("running") == [], "nothing has changed"
     clock.now_s = 29.0
-    assert heard("running") == []
+    assert received("running") == []
     clock.now_s = 31.0
-    assert heard("running") == ["running"]
-    assert heard("stopping") == ["stopping"], "whoever leaves says so"
-    key, answer = said[-1]
+    assert received("running") == ["running"]
+    assert received("stopping") == ["stopping"], "whoever leaves says so"
+    key, answer = reported[-1]
     assert key == KEYS.last(PAIR)
     word = last_word.decode_heartbeat(key, answer.payload)
     assert (word.state, word.provenance, word.period_s, word.version) == ("unknown", "nominal", 30.0, "1.2")
 
 
-def test_of_a_pair_that_is_not_there_nothing_is_said() -> None:
+def test_of_a_pair_that_is_not_there_nothing_is_reported() -> None:
     with pytest.raises(NotFoundError):
         Heartbeats(KEYS, "0", PERIOD, lambda *_: None).answer("front", "json")
 

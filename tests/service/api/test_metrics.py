@@ -137,7 +137,7 @@ def test_the_older_text_format_has_the_same_samples_below_families_that_it_knows
     assert not [line for line in older if line.startswith("# UNIT")]
 
 
-def test_what_a_service_knows_is_told() -> None:
+def test_what_a_service_knows_is_reported() -> None:
     families = read()
     for name, suffix, labels, value in [
         ("coec_health", "", {"pair": "front", "coec_health": "healthy"}, 1),
@@ -166,15 +166,15 @@ def test_what_a_service_knows_is_told() -> None:
         assert families[name].value(suffix, **labels) == value, name
 
 
-def test_what_is_not_known_is_not_told() -> None:
+def test_what_is_not_known_is_not_reported() -> None:
     families = read()
-    told = {labels for _, labels in families["coec_diagnosis"].samples}
-    assert (("metric", "overlap"), ("pair", "front")) not in told, "it could not be computed"
+    reported = {labels for _, labels in families["coec_diagnosis"].samples}
+    assert (("metric", "overlap"), ("pair", "front")) not in reported, "it could not be computed"
     assert not [one for _, one in families["coec_drift"].samples if dict(one)["axis"] == "rz"], "it was not estimated"
     assert {dict(labels)["stream"] for _, labels in families["coec_sample_age_seconds"].samples} == {"camera"}
 
 
-def test_of_a_rig_its_sensors_are_told_its_fit_and_what_was_lost() -> None:
+def test_of_a_rig_its_sensors_are_reported_its_fit_and_what_was_lost() -> None:
     families = read(moved_lidar_reply())
     for name, suffix, labels, value in [
         ("coec_sensor", "", {"sensor": "roof", "coec_sensor": "lidar_moved"}, 1),

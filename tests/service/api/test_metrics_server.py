@@ -37,12 +37,12 @@ def test_health_is_good_when_every_pair_may_be_used() -> None:
 
 def test_there_are_three_pages() -> None:
     find = pages(lambda form: form.name.encode(), a_busy_status, dict, lambda: True)
-    plain, asked = find(HttpRequest("/metrics")), find(HttpRequest("/metrics", "application/openmetrics-text"))
+    plain, requested = find(HttpRequest("/metrics")), find(HttpRequest("/metrics", "application/openmetrics-text"))
     assert plain is not None
-    assert asked is not None
+    assert requested is not None
     assert (plain.body, plain.content_type) == (b"PROMETHEUS", "text/plain; version=0.0.4; charset=utf-8")
-    assert asked.body == b"OPEN_METRICS"
-    assert asked.content_type == "application/openmetrics-text; version=1.0.0; charset=utf-8"
+    assert requested.body == b"OPEN_METRICS"
+    assert requested.content_type == "application/openmetrics-text; version=1.0.0; charset=utf-8"
     assert [find(HttpRequest(path)) for path in ("/", "/metrics/", "/config", "")] == [None] * 4
 
 
@@ -142,7 +142,7 @@ def test_the_door_follows_the_configuration(door: MetricsServer) -> None:
     "the port of the metrics is taken",
     "status says so; the calibration goes on, and the port is tried again with the next reload",
 )
-def test_a_taken_port_is_a_trouble_and_no_end(door: MetricsServer) -> None:
+def test_a_taken_port_is_a_problem_and_no_end(door: MetricsServer) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         door.reconfigure(MetricsConfig(http=f"127.0.0.1:{port}"))
@@ -154,7 +154,7 @@ def test_a_taken_port_is_a_trouble_and_no_end(door: MetricsServer) -> None:
     assert answers(port)
 
 
-def test_a_router_that_is_away_is_told_once_each_time(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_router_that_is_away_is_reported_once_each_time(caplog: pytest.LogCaptureFixture) -> None:
     there = iter([False, False, True, True, False, True])
     clock = count(100, 10)
     watch = RouterMonitor(("tcp/10.0.0.1:7447",), lambda: next(there), lambda: float(next(clock)))
@@ -179,11 +179,11 @@ def test_a_night_without_a_router_is_a_few_lines(caplog: pytest.LogCaptureFixtur
     with caplog.at_level(logging.INFO):
         for _ in range(8 * 3600):
             watch.check()
-    said = [message for message in caplog.messages if "trying again" in message]
-    assert said == caplog.messages
-    assert said[1] == "no router at tcp/10.0.0.1:7447 for 60 s, trying again"
-    assert said[2] == "no router at tcp/10.0.0.1:7447 for 180 s, trying again"
-    assert 8 <= len(said) <= 20
+    reported = [message for message in caplog.messages if "trying again" in message]
+    assert reported == caplog.messages
+    assert reported[1] == "no router at tcp/10.0.0.1:7447 for 60 s, trying again"
+    assert reported[2] == "no router at tcp/10.0.0.1:7447 for 180 s, trying again"
+    assert 8 <= len(reported) <= 20
     assert watch.problem is not None
 
 

@@ -23,7 +23,7 @@ def test_what_says_nothing_about_the_calibration_leaves_a_pair_healthy() -> None
         assert (health.state, [reason.code for reason in health.reasons]) == (HealthState.HEALTHY, [code])
 
 
-def test_every_other_trouble_degrades_a_healthy_pair_and_no_other() -> None:
+def test_every_other_problem_degrades_a_healthy_pair_and_no_other() -> None:
     for code in PROBLEMS.keys() - HARMLESS:
         reason = Reason(code, "It is so.")
         assert with_problems(HEALTHY, (reason,)).state is HealthState.DEGRADED

@@ -37,29 +37,29 @@ def put(store: WindowStore, number: int) -> str:
     return name
 
 
-def listed(told: WindowsList) -> WindowsReply:
-    return from_msgpack(WindowsReply, told.answer("msgpack").payload)
+def listed(reported: WindowsList) -> WindowsReply:
+    return from_msgpack(WindowsReply, reported.answer("msgpack").payload)
 
 
 def test_it_says_what_is_there_now(tmp_path: Path) -> None:
     store = WindowStore(tmp_path / "windows", StateConfig(min_free_bytes=0))
     snippets = SnippetStore(tmp_path / "snippets", 2**20, 0)
-    told = WindowsList("v7", "front", store, snippets)
-    assert listed(told).windows == ()
+    reported = WindowsList("v7", "front", store, snippets)
+    assert listed(reported).windows == ()
     first = put(store, 1)
-    assert [info.window_id for info in listed(told).windows] == [first]
+    assert [info.window_id for info in listed(reported).windows] == [first]
     store.protect("front", {first: "red_event"})
-    assert [info.kept_for for info in listed(told).windows] == ["red_event"]
+    assert [info.kept_for for info in listed(reported).windows] == ["red_event"]
     version = store.version(first)
     assert version is not None
     store.note(first, WindowVersion(**{**version.model_dump(), "decision": "accepted"}))
     snippets.add(
         SnippetInfo(snippet_id="front-5.snippet", event="suspect", stamp_ns=5, recorded_ns=6, size_bytes=7, sha256="00")
     )
-    reply = listed(told)
+    reply = listed(reported)
     assert [info.decision for info in reply.windows] == ["accepted"]
     assert [info.event for info in reply.snippets] == ["suspect"]
-    answer = told.answer("json")
+    answer = reported.answer("json")
     assert answer.encoding == "application/json"
     assert json.loads(answer.payload) == reply.model_dump(mode="json")
 
@@ -80,12 +80,12 @@ def test_a_list_of_thousands_is_packed_once(
         return answer_of(model, form)
 
     monkeypatch.setattr("coec.service.api.pair_answers.answer_of", counted)
-    told = WindowsList("v7", "front", WindowStore(folder, StateConfig(min_free_bytes=0)), None)
+    reported = WindowsList("v7", "front", WindowStore(folder, StateConfig(min_free_bytes=0)), None)
     took_s = []
     for _ in range(20):
-        begun_s = time.process_time()
-        assert len(told.answer("msgpack").payload) > 100_000
-        took_s.append(time.process_time() - begun_s)
+        started_s = time.process_time()
+        assert len(reported.answer("msgpack").payload) > 100_000
+        took_s.append(time.process_time() - started_s)
     assert packed == 1
     record_property(
         "figure", f"first {1e3 * took_s[0]:.0f} ms of processor, then {1e3 * statistics.median(took_s):.2f} ms"

@@ -36,7 +36,7 @@ def pair(**of: Any) -> OpenPairConfig:
     return OpenPairConfig.model_validate({"name": "front", "camera": "/front/image_raw", "points": "/top/points", **of})
 
 
-def heard(**of: Any) -> ReceivedMetadata:
+def received(**of: Any) -> ReceivedMetadata:
     given: dict[str, Any] = {"image": ReceivedImage("cam", 64, 48), "cloud": "top", "ego": "base", "info": INFO}
     return ReceivedMetadata(**given | of)
 
@@ -50,24 +50,24 @@ def tree(*joints: tuple[str, str, NDArray[np.float64]]) -> StaticTransforms:
 VEHICLE = (("base", "cam", T_BASE_CAMERA), ("base", "top", T_BASE_TOP))
 
 
-def found(
-    asked: OpenPairConfig, told: ReceivedMetadata | None = None, transforms: StaticTransforms | None = None
+def detected(
+    requested: OpenPairConfig, reported: ReceivedMetadata | None = None, transforms: StaticTransforms | None = None
 ) -> DiscoveredPair:
-    result = discover(asked, told or heard(), transforms or tree(*VEHICLE))
+    result = discover(requested, reported or received(), transforms or tree(*VEHICLE))
     assert isinstance(result, DiscoveredPair), result
     return result
 
 
 def missing(
-    asked: OpenPairConfig, told: ReceivedMetadata | None = None, transforms: StaticTransforms | None = None
+    requested: OpenPairConfig, reported: ReceivedMetadata | None = None, transforms: StaticTransforms | None = None
 ) -> list[str]:
-    result = discover(asked, told or heard(), tree(*VEHICLE) if transforms is None else transforms)
+    result = discover(requested, reported or received(), tree(*VEHICLE) if transforms is None else transforms)
     assert not isinstance(result, DiscoveredPair)
     return [reason.code for reason in result]
 
 
 def test_two_topics_come_to_a_rig() -> None:
-    complete = found(pair(ego="/odometry"))
+    complete = detected(pair(ego="/odometry"))
     built = complete.pair
     assert (built.camera.frame_id, built.lidar.frame_id, built.lidar.cloud_frame_id) == ("cam", "top", None)
     assert built.camera.intrinsics.model == "pinhole"
@@ -82,20 +82,20 @@ def test_what_the_configuration_gives_it_gives() -> None:
     given = np.eye(4).tolist()
     intrinsics = {"model": "pinhole", "width": 8, "height": 6, "fx": 4.0, "fy": 4.0, "cx": 4.0, "cy": 3.0}
     camera = {"topic": "/front/image_raw", "intrinsics": intrinsics, "frame_id": "mine"}
-    asked = pair(camera=camera, T_camera_lidar=given)
-    built = found(asked, heard(image=None, info=None), StaticTransforms())
+    requested = pair(camera=camera, T_camera_lidar=given)
+    built = detected(requested, received(image=None, info=None), StaticTransforms())
     assert built.pair.camera.frame_id == "mine"
     assert built.pair.camera.intrinsics.fx == 4.0
     np.testing.assert_array_equal(built.pair.T_camera_lidar, given)
     assert set(built.origins) == {"lidar.frame_id"}
-    assert info_topic_of(asked) is None
-    assert not needs_transforms(asked)
+    assert info_topic_of(requested) is None
+    assert not needs_transforms(requested)
 
 
 def test_a_lidar_whose_clouds_come_in_another_frame() -> None:
-    asked = pair()
-    asked = asked.model_copy(update={"lidar": asked.lidar.model_copy(update={"frame_id": "top"})})
-    built = found(asked, heard(cloud="/base")).pair
+    requested = pair()
+    requested = requested.model_copy(update={"lidar": requested.lidar.model_copy(update={"frame_id": "top"})})
+    built = detected(requested, received(cloud="/base")).pair
     assert (built.lidar.frame_id, built.lidar.cloud_frame_id) == ("top", "/base")
     np.testing.assert_allclose(built.lidar.T_cloud_lidar, T_BASE_TOP, rtol=0, atol=1e-12)
     np.testing.assert_allclose(built.T_camera_lidar, T_CAMERA_TOP, rtol=0, atol=1e-12)
@@ -103,37 +103,37 @@ def test_a_lidar_whose_clouds_come_in_another_frame() -> None:
 
 def test_rectified_images_take_their_own_matrix() -> None:
     p = (40.0, 0.0, 30.0, 0.0, 0.0, 41.0, 22.0, 0.0, 0.0, 0.0, 1.0, 0.0)
-    told = heard(info=replace(INFO, model="equidistant", d=(0.1, 0.2, 0.3, 0.4), p=p))
-    built = found(pair(camera="/front/image_rect"), told).pair
+    reported = received(info=replace(INFO, model="equidistant", d=(0.1, 0.2, 0.3, 0.4), p=p))
+    built = detected(pair(camera="/front/image_rect"), reported).pair
     assert (built.camera.intrinsics.model, built.camera.intrinsics.fx) == ("pinhole", 40.0)
 
 
 @pytest.mark.parametrize(
-    ("told", "joints", "codes"),
+    ("reported", "joints", "codes"),
     [
         (ReceivedMetadata(), (), ["no_camera_info", "no_image", "no_cloud"]),
-        (heard(info=None), VEHICLE, ["no_camera_info"]),
-        (heard(image=None), VEHICLE, ["no_image"]),
-        (heard(cloud=None), VEHICLE, ["no_cloud"]),
-        (heard(ego=None), VEHICLE, ["no_motion"]),
-        (heard(), (), ["tf_static", "tf_static"]),
-        (heard(), VEHICLE[:1], ["tf_static", "tf_static"]),
-        (heard(), (*VEHICLE, ("roof", "top", T_BASE_TOP)), ["tf_static_no_tree", "tf_static_no_tree"]),
-        (heard(image=ReceivedImage("cam", 64, 40)), VEHICLE, ["camera_info_size"]),
-        (heard(image=ReceivedImage("", 64, 48)), VEHICLE, ["no_frame_id"]),
-        (heard(cloud=""), VEHICLE, ["no_frame_id"]),
-        (heard(info=replace(INFO, k=(0.0,) * 9)), VEHICLE, ["camera_info_refused"]),
-        (heard(refused={"info": "message_malformed"}), VEHICLE, ["camera_info_refused"]),
+        (received(info=None), VEHICLE, ["no_camera_info"]),
+        (received(image=None), VEHICLE, ["no_image"]),
+        (received(cloud=None), VEHICLE, ["no_cloud"]),
+        (received(ego=None), VEHICLE, ["no_motion"]),
+        (received(), (), ["tf_static", "tf_static"]),
+        (received(), VEHICLE[:1], ["tf_static", "tf_static"]),
+        (received(), (*VEHICLE, ("roof", "top", T_BASE_TOP)), ["tf_static_no_tree", "tf_static_no_tree"]),
+        (received(image=ReceivedImage("cam", 64, 40)), VEHICLE, ["camera_info_size"]),
+        (received(image=ReceivedImage("", 64, 48)), VEHICLE, ["no_frame_id"]),
+        (received(cloud=""), VEHICLE, ["no_frame_id"]),
+        (received(info=replace(INFO, k=(0.0,) * 9)), VEHICLE, ["camera_info_refused"]),
+        (received(refused={"info": "message_malformed"}), VEHICLE, ["camera_info_refused"]),
     ],
 )
-def test_what_is_missing_is_said(told: ReceivedMetadata, joints: Any, codes: list[str]) -> None:
-    assert missing(pair(ego="/odometry"), told, tree(*joints)) == codes
+def test_what_is_missing_is_reported(reported: ReceivedMetadata, joints: Any, codes: list[str]) -> None:
+    assert missing(pair(ego="/odometry"), reported, tree(*joints)) == codes
 
 
-def test_the_frames_that_are_there_are_listed_and_no_others_words() -> None:
+def test_the_frames_that_are_there_are_listed_and_no_others_text() -> None:
     joints = [("base", f"f{index}", np.eye(4)) for index in range(40)]
     transforms = tree(*joints, ("base", "\x1b[2Jevil", np.eye(4)))
-    result = discover(pair(), heard(cloud="\x1b[31m"), transforms)
+    result = discover(pair(), received(cloud="\x1b[31m"), transforms)
     assert not isinstance(result, DiscoveredPair)
     (text,) = (reason.text for reason in result)
     assert "'cam' and (a frame whose name is not plain)" in text
@@ -143,18 +143,18 @@ def test_the_frames_that_are_there_are_listed_and_no_others_words() -> None:
     assert "evil" not in text
 
 
-def test_what_the_bus_says_otherwise_is_told() -> None:
-    asked, told = pair(ego="/odometry"), heard()
-    built = found(asked, told)
-    assert change_since(built, asked, told, tree(*VEHICLE)) is None
-    assert change_since(built, asked, ReceivedMetadata(), StaticTransforms()) is None, "silence says nothing"
+def test_what_the_bus_reports_otherwise_is_reported() -> None:
+    requested, reported = pair(ego="/odometry"), received()
+    built = detected(requested, reported)
+    assert change_since(built, requested, reported, tree(*VEHICLE)) is None
+    assert change_since(built, requested, ReceivedMetadata(), StaticTransforms()) is None, "silence says nothing"
     moved = tree(VEHICLE[0], ("base", "top", se3.perturb(T_BASE_TOP, np.array([1e-3, 0.0, 0.0, 0.0, 0.0, 0.0]))))
-    reason = change_since(built, asked, told, moved)
+    reason = change_since(built, requested, reported, moved)
     assert reason is not None
     assert reason.code == "nominal_changed"
     assert "/tf_static, for T_camera_lidar" in reason.text
     assert "CameraInfo" not in reason.text
     for other in (replace(INFO, k=(50.1, *K[1:])), replace(INFO, k=(0.0,) * 9)):
-        reason = change_since(built, asked, heard(info=other), tree(*VEHICLE))
+        reason = change_since(built, requested, received(info=other), tree(*VEHICLE))
         assert reason is not None
         assert "CameraInfo on /front/camera_info" in reason.text

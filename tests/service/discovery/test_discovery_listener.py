@@ -46,7 +46,7 @@ INFO = cdr(messages.serialized(camera_info_message("plumb_bob", []), messages.CA
 TREE = cdr(transforms_of(("camera", "lidar", T_BASE_TOP)), messages.TF)
 
 
-def heard_all() -> DiscoveryListener:
+def received_all() -> DiscoveryListener:
     watch = DiscoveryListener(CONFIG, {})
     watch.take_frame("front", CAMERA, IMAGE)
     watch.take_frame("front", LIDAR, POINTS)
@@ -85,8 +85,8 @@ def test_in_any_order_a_pair_is_ready_once() -> None:
     }  # fmt: skip
 
 
-def test_what_cannot_be_built_is_awaited_until_something_else_is_heard() -> None:
-    watch = heard_all()
+def test_what_cannot_be_built_is_pending_until_something_else_is_received() -> None:
+    watch = received_all()
     watch.update()
     watch.ready()
     watch.end("front", Reason("cannot_be_built", "No."))
@@ -101,11 +101,11 @@ def test_what_cannot_be_built_is_awaited_until_something_else_is_heard() -> None
     np.testing.assert_array_equal(watch.ready()["front"].pair.T_camera_lidar, np.eye(4))
 
 
-def test_what_changes_after_it_was_built_is_told_and_changes_nothing() -> None:
-    watch = heard_all()
+def test_what_changes_after_it_was_built_is_reported_and_changes_nothing() -> None:
+    watch = received_all()
     watch.update()
-    found = watch.ready()["front"]
-    watch.end("front", found)
+    result = watch.ready()["front"]
+    watch.end("front", result)
     watch.update()
     watch.take_transforms(cdr(transforms_of(("camera", "lidar", np.eye(4))), messages.TF))
     watch.update()
@@ -117,8 +117,8 @@ def test_what_changes_after_it_was_built_is_told_and_changes_nothing() -> None:
     assert watch.nominal("front").changed is None
 
 
-def test_a_pair_that_was_found_before_the_start_is_only_watched() -> None:
-    first = heard_all()
+def test_a_pair_that_was_discovered_before_the_start_is_only_watched() -> None:
+    first = received_all()
     first.update()
     earlier = first.ready()
     watch = DiscoveryListener(CONFIG, earlier)
@@ -153,8 +153,8 @@ def test_rubbish_is_counted_by_its_cause_and_what_comes_after_it_is_taken() -> N
 
 
 @pytest.mark.fault("messages of 32 MB on /tf_static and CameraInfo", "none is kept; they are counted by cause")
-def test_messages_larger_than_any_are_not_kept() -> None:
-    watch = heard_all()
+def test_messages_larger_than_any_are_not_retained() -> None:
+    watch = received_all()
     watch.update()
     watch.ready()
     tracemalloc.start()
@@ -176,7 +176,7 @@ def test_a_decoder_that_fails_costs_its_sample(monkeypatch: pytest.MonkeyPatch) 
     def broken(*_: object) -> None:
         raise RuntimeError("broken")
 
-    watch = heard_all()
+    watch = received_all()
     with monkeypatch.context() as patched:
         patched.setattr("coec.service.ingest.decoder.SampleReader.frame", broken)
         patched.setattr("coec.service.discovery_listener.decode_static_transforms", broken)
@@ -189,7 +189,7 @@ def test_a_decoder_that_fails_costs_its_sample(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.fault("a flood of static transforms", "512 messages wait at most, 64 are read in a quarter of a second")
 def test_a_flood_of_transforms_is_bounded_and_the_newest_count() -> None:
-    watch = heard_all()
+    watch = received_all()
     for step in range(3 * TRANSFORMS_WAITING):
         watch.take_transforms(cdr(transforms_of((f"p{step}", f"c{step}", np.eye(4))), messages.TF))
     watch.take_transforms(TREE)

@@ -26,22 +26,22 @@ def report(
     unanswered: int = 0,
 ) -> StreamStatistics:
     streams = {CAMERA: StreamCounts(camera, camera - refused), LIDAR: StreamCounts(lidar, lidar)}
-    chosen = SelectionStatistics(checks=checks, not_afforded=not_afforded, unanswered=unanswered, last_ns=1000 * S)
-    return StreamStatistics(streams=streams, pairs=pairs, selection=chosen, pace=1.0)
+    selected = SelectionStatistics(checks=checks, not_afforded=not_afforded, unanswered=unanswered, last_ns=1000 * S)
+    return StreamStatistics(streams=streams, pairs=pairs, selection=selected, pace=1.0)
 
 
 BEGIN = report()
 ALL = report(camera=100, lidar=100, pairs=100, checks=3)
 
 
-def begun() -> CheckProgress:
+def started() -> CheckProgress:
     progress = CheckProgress(PERIOD_S, 0.0, BEGIN)
     progress.completed(1000 * S, 100.0, BEGIN, acquits=True)
     return progress
 
 
 def test_three_periods_on_the_steady_clock() -> None:
-    progress = begun()
+    progress = started()
     assert progress.overdue(ALL, 115.0, at_rest=False) is None
     late = progress.overdue(ALL, 115.1, at_rest=False)
     assert late is not None
@@ -52,7 +52,7 @@ def test_three_periods_on_the_steady_clock() -> None:
 
 @pytest.mark.fault("checks are completed, and none acquits the extrinsic", "after three periods the pair is not green")
 def test_checks_that_do_not_acquit_renew_nothing() -> None:
-    progress = begun()
+    progress = started()
     for second in (105.0, 110.0, 114.0):
         progress.completed(round((900.0 + second) * S), second, ALL, acquits=False)
     assert progress.overdue(ALL, 115.0, at_rest=False) is None
@@ -65,7 +65,7 @@ def test_checks_that_do_not_acquit_renew_nothing() -> None:
 
 
 def test_on_the_clock_of_the_sensors_a_replay_may_run_ahead_of_the_answers_by_a_period_more() -> None:
-    progress = begun()
+    progress = started()
     ahead = replace(ALL, pace=10.0, selection=replace(ALL.selection, last_ns=1020 * S))
     assert progress.overdue(ahead, 101.0, at_rest=False) is None
     late = replace(ahead, selection=replace(ahead.selection, last_ns=1020 * S + 1))
@@ -76,10 +76,12 @@ def test_on_the_clock_of_the_sensors_a_replay_may_run_ahead_of_the_answers_by_a_
 
 def test_a_replay_slower_than_the_drive_has_as_much_longer() -> None:
     half = replace(ALL, pace=0.5)
-    assert begun().overdue(half, 130.0, at_rest=False) is None
-    assert begun().overdue(half, 130.1, at_rest=False) is not None
+    assert started().overdue(half, 130.0, at_rest=False) is None
+    assert started().overdue(half, 130.1, at_rest=False) is not None
     crawling = replace(ALL, pace=1e-6)
-    assert begun().overdue(crawling, 100.0 + 150.1, at_rest=False) is not None, "slower than a tenth is standing still"
+    assert started().overdue(crawling, 100.0 + 150.1, at_rest=False) is not None, (
+        "slower than a tenth is standing still"
+    )
 
 
 @pytest.mark.fault("a stream that stops", "health names the first thing that stands still")
@@ -97,7 +99,7 @@ def test_a_replay_slower_than_the_drive_has_as_much_longer() -> None:
     ],
 )
 def test_the_first_thing_that_stands_still_is_named(now: StreamStatistics, code: str, word: str) -> None:
-    late = begun().overdue(now, 116.0, at_rest=False)
+    late = started().overdue(now, 116.0, at_rest=False)
     assert late is not None
     assert late.code == f"overdue_{code}"
     assert word in late.text
@@ -114,14 +116,14 @@ def test_the_first_thing_that_stands_still_is_named(now: StreamStatistics, code:
     ],
 )
 def test_a_failure_is_named_by_whose_it_is(failure: str, code: str) -> None:
-    progress = begun()
+    progress = started()
     progress.failed(Reason(failure, "It went wrong."))
     late = progress.overdue(ALL, 116.0, at_rest=False)
     assert late is not None
     assert (late.code, late.text) == (f"overdue_{code}", "No check has been completed for 16 s: It went wrong.")
 
 
-def test_three_attempts_in_a_row_that_come_to_nothing_are_a_trouble_and_one_that_does_ends_it() -> None:
+def test_three_attempts_in_a_row_that_come_to_nothing_are_a_problem_and_one_that_does_ends_it() -> None:
     attempts = Attempts("windows", "windows_in_vain")
     for text in ("No edges.", "No edges."):
         attempts.failed(Reason("range_edges", text))

@@ -18,9 +18,9 @@ __all__ = ["with_extra"]
 
 @pytest.mark.usefixtures("with_extra")
 def test_every_two_lidars_of_the_pairs_in_their_order() -> None:
-    found = plan_lidar_pairs([lidar_pair(lidar) for lidar in LIDARS], 15.0)
-    assert [one.edge.name for one in found] == ["roof to bumper", "roof to trunk", "bumper to trunk"]
-    for one in found:
+    result = plan_lidar_pairs([lidar_pair(lidar) for lidar in LIDARS], 15.0)
+    assert [one.edge.name for one in result] == ["roof to bumper", "roof to trunk", "bumper to trunk"]
+    for one in result:
         assert one.why_not is None
         truth = LIDAR_POSES[one.rig.a] @ se3.inverse(LIDAR_POSES[one.rig.b])
         np.testing.assert_allclose(one.rig.T_a_b_nominal, truth, atol=1e-9)
@@ -28,7 +28,7 @@ def test_every_two_lidars_of_the_pairs_in_their_order() -> None:
 
 
 @pytest.mark.fault("the extra lidars is not installed", "status and rig say so; nothing breaks")
-def test_what_is_not_installed_is_said_and_breaks_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_not_installed_is_reported_and_breaks_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(nearest_neighbours, "installed", lambda: False)
     bench = LidarBench(tmp_path)
     bench.drive(0.0, 20.0)
@@ -41,7 +41,7 @@ def test_what_is_not_installed_is_said_and_breaks_nothing(tmp_path: Path, monkey
 
 
 @pytest.mark.usefixtures("with_extra")
-def test_what_is_switched_off_or_cannot_be_is_said(tmp_path: Path) -> None:
+def test_what_is_switched_off_or_cannot_be_is_reported(tmp_path: Path) -> None:
     off = LidarBench(tmp_path / "off", period_s=0.0)
     assert [reason.code for reason in off.reply_between("roof to bumper").reasons] == ["switched_off"]
     assert off.edges.problem is None
@@ -49,9 +49,9 @@ def test_what_is_switched_off_or_cannot_be_is_said(tmp_path: Path) -> None:
     assert [reason.code for reason in without.reply_between("roof to bumper").reasons] == ["no_ego_motion"]
     rear = lidar_pair("bumper")
     rear = rear.model_copy(update={"camera": rear.camera.model_copy(update={"name": "rear", "key": "in/rear"})})
-    (apart,) = plan_lidar_pairs([lidar_pair("roof"), rear], 15.0)
-    assert apart.why_not is not None
-    assert apart.why_not.code == "no_nominal_pose"
+    (separation,) = plan_lidar_pairs([lidar_pair("roof"), rear], 15.0)
+    assert separation.why_not is not None
+    assert separation.why_not.code == "no_nominal_pose"
 
 
 @pytest.mark.usefixtures("with_extra")
@@ -60,13 +60,13 @@ def test_their_number_is_bounded() -> None:
     for number in range(4):
         lidar = lidars[0].lidar.model_copy(update={"name": f"lidar{number}", "key": f"in/lidar{number}"})
         lidars.append(lidars[0].model_copy(update={"name": f"front-lidar{number}", "lidar": lidar}))
-    found = plan_lidar_pairs(lidars, 15.0)
-    assert [one.why_not for one in found].count(None) == lidar_pairs.MAX_LIDAR_PAIRS
-    assert {one.why_not.code for one in found if one.why_not is not None} == {"too_many"}
+    result = plan_lidar_pairs(lidars, 15.0)
+    assert [one.why_not for one in result].count(None) == lidar_pairs.MAX_LIDAR_PAIRS
+    assert {one.why_not.code for one in result if one.why_not is not None} == {"too_many"}
 
 
 @pytest.mark.usefixtures("with_extra")
-def test_lidars_of_pairs_that_are_found_later_join(tmp_path: Path) -> None:
+def test_lidars_of_pairs_that_are_detected_later_join(tmp_path: Path) -> None:
     bench = LidarBench(tmp_path, lidars=("roof", "bumper"))
     bench.join("trunk")
     bench.edges.grow([lidar_pair(lidar) for lidar in LIDARS])

@@ -21,15 +21,15 @@ pytestmark = pytest.mark.usefixtures("with_extra")
 __all__ = ["with_extra"]
 
 EDGE = "roof to bumper"
-KNOCKED_S = 60.0
+DISPLACED_S = 60.0
 TURN = np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.0, 0.0])
 
 
-def knocked(name: str) -> Callable[[LidarRig, int], Answer | Reason]:
+def displaced(name: str) -> Callable[[LidarRig, int], Answer | Reason]:
     moved = {**LIDAR_POSES, name: se3.perturb(LIDAR_POSES[name], TURN)}
 
     def answers(rig: LidarRig, stamp_ns: int) -> Answer:
-        return registration(rig, relative_pose(moved if stamp_ns >= KNOCKED_S * NS else LIDAR_POSES, rig), stamp_ns)
+        return registration(rig, relative_pose(moved if stamp_ns >= DISPLACED_S * NS else LIDAR_POSES, rig), stamp_ns)
 
     return answers
 
@@ -38,21 +38,21 @@ def states(bench: LidarBench) -> dict[str, str]:
     return {sensor.name: sensor.state for sensor in bench.reply.sensors}
 
 
-def test_every_two_lidars_are_told_with_their_age_and_uncertainty(tmp_path: Path) -> None:
+def test_every_two_lidars_are_reported_with_their_age_and_uncertainty(tmp_path: Path) -> None:
     bench = LidarBench(tmp_path)
     assert {one.name: one.state for one in bench.reply.lidars} == dict.fromkeys(
         ("roof to bumper", "roof to trunk", "bumper to trunk"), "waiting"
     )
     bench.drive(0.0, 40.0)
-    found = bench.reply_between(EDGE)
-    assert (found.state, found.looks, found.losses) == ("measured", 2, {})
-    assert found.measured_ns == found.stamp_ns == 17 * NS
-    assert found.a_from_b is not None
-    pose = np.array(found.a_from_b.matrix)
+    result = bench.reply_between(EDGE)
+    assert (result.state, result.looks, result.losses) == ("measured", 2, {})
+    assert result.measured_ns == result.stamp_ns == 17 * NS
+    assert result.a_from_b is not None
+    pose = np.array(result.a_from_b.matrix)
     truth = LIDAR_POSES["roof"] @ se3.inverse(LIDAR_POSES["bumper"])
     assert np.abs(se3.difference(pose, truth)).max() < 0.03
-    assert found.sigma is not None
-    assert 0.01 < found.sigma[0] < 0.1
+    assert result.sigma is not None
+    assert 0.01 < result.sigma[0] < 0.1
     assert bench.reply.looks == dict.fromkeys(("bumper to trunk", "roof to bumper", "roof to trunk"), 2)
     assert from_json(RigReply, to_json(bench.reply)) == bench.reply
     assert {pair for sensor in bench.reply.sensors for pair in sensor.pairs} == {f"front-{name}" for name in LIDARS}
@@ -60,34 +60,34 @@ def test_every_two_lidars_are_told_with_their_age_and_uncertainty(tmp_path: Path
 
 @pytest.mark.fault("a LiDAR is knocked, and no camera sees anything", "the other LiDARs alone name it")
 @pytest.mark.parametrize("name", ["roof", "bumper"])
-def test_a_knocked_lidar_is_named_by_the_others_alone(
+def test_a_displaced_lidar_is_named_by_the_others_alone(
     tmp_path: Path, name: str, record_property: Callable[[str, object], None]
 ) -> None:
-    bench = LidarBench(tmp_path, knocked(name))
-    bench.drive(0.0, KNOCKED_S)
+    bench = LidarBench(tmp_path, displaced(name))
+    bench.drive(0.0, DISPLACED_S)
     assert {states(bench)[lidar] for lidar in LIDARS} == {"calibrated"}
-    at_s = KNOCKED_S
-    while states(bench)[name] != "lidar_moved" and at_s < KNOCKED_S + 90.0:
+    at_s = DISPLACED_S
+    while states(bench)[name] != "lidar_moved" and at_s < DISPLACED_S + 90.0:
         bench.drive(at_s, at_s + 5.0)
         at_s += 5.0
-    told = states(bench)
-    assert {lidar for lidar in LIDARS if told[lidar] == "lidar_moved"} == {name}
-    assert at_s <= KNOCKED_S + 60.0
-    record_property("figure", f"{at_s - KNOCKED_S:.0f} s after the knock")
+    reported = states(bench)
+    assert {lidar for lidar in LIDARS if reported[lidar] == "lidar_moved"} == {name}
+    assert at_s <= DISPLACED_S + 60.0
+    record_property("figure", f"{at_s - DISPLACED_S:.0f} s after the knock")
 
 
 @pytest.mark.fault("sweeps and answers come in another order", "the same reply, to the byte")
-def test_another_order_of_arrival_tells_the_same_to_the_byte(tmp_path: Path) -> None:
-    told, asked = set(), set()
+def test_another_order_of_arrival_gives_the_same_to_the_byte(tmp_path: Path) -> None:
+    reported, requested = set(), set()
     for seed, slow in ((None, 1.0), (1, 0.2), (2, 0.5)):
-        bench = LidarBench(tmp_path / str(seed), knocked("bumper"), seed=seed, slow=slow)
-        bench.drive(0.0, KNOCKED_S + 45.0)
+        bench = LidarBench(tmp_path / str(seed), displaced("bumper"), seed=seed, slow=slow)
+        bench.drive(0.0, DISPLACED_S + 45.0)
         bench.slow = 1.0
         bench.settle()
-        told.add(to_json(bench.reply.model_copy(update={"stamp_ns": None})))
-        asked.add(tuple(sorted(bench.worker.stamps)))
-    assert len(asked) == 1
-    assert len(told) == 1
+        reported.add(to_json(bench.reply.model_copy(update={"stamp_ns": None})))
+        requested.add(tuple(sorted(bench.worker.stamps)))
+    assert len(requested) == 1
+    assert len(reported) == 1
 
 
 @pytest.mark.fault("a registration takes long", "the pairs of the vehicle wait for it, and not for ever")
@@ -125,8 +125,8 @@ def test_a_worker_that_fails_is_a_reason_and_no_end(tmp_path: Path) -> None:
 
     bench = LidarBench(tmp_path, answers)
     bench.drive(0.0, 30.0)
-    found = bench.reply_between(EDGE)
-    assert (found.state, [reason.code for reason in found.reasons]) == ("refused", ["worker_failed"])
+    result = bench.reply_between(EDGE)
+    assert (result.state, [reason.code for reason in result.reasons]) == ("refused", ["worker_failed"])
     bench.drive(30.0, 60.0)
     assert bench.reply_between(EDGE).state == "measured"
     assert bench.reply_between(EDGE).reasons == ()
@@ -134,50 +134,50 @@ def test_a_worker_that_fails_is_a_reason_and_no_end(tmp_path: Path) -> None:
 
 @pytest.mark.fault("two LiDARs see nothing in common", "this is reported, and tried an eighth as often")
 def test_lidars_that_do_not_overlap_are_let_rest(tmp_path: Path) -> None:
-    apart = Reason("lidar_overlap", "roof and bumper have too little in view in common.")
+    separation = Reason("lidar_overlap", "roof and bumper have too little in view in common.")
 
     def answers(rig: LidarRig, stamp_ns: int) -> Answer:
         del stamp_ns
-        return Registered(rig.T_a_b_nominal, np.eye(6), RangeBias(0.0, 0.03), float("nan"), 0, 0.0, 2, (apart,))
+        return Registered(rig.T_a_b_nominal, np.eye(6), RangeBias(0.0, 0.03), float("nan"), 0, 0.0, 2, (separation,))
 
     bench = LidarBench(tmp_path, answers, lidars=("roof", "bumper"))
     bench.drive(0.0, 15.0 * (2 * RESTS + 5))
     assert bench.reply_between(EDGE).state == "refused"
-    looks = [stamp_ns // (15 * NS) for _, stamp_ns in bench.worker.stamps]
-    assert looks == [0, RESTS + 1, 2 * RESTS + 2]
+    observations = [stamp_ns // (15 * NS) for _, stamp_ns in bench.worker.stamps]
+    assert observations == [0, RESTS + 1, 2 * RESTS + 2]
     rig = bench.states[-1].rig
     assert rig is not None
     assert EDGE not in rig.graph.edge
 
 
 @pytest.mark.parametrize(("code", "speed_mps", "timed"), [("vehicle_stands", 0.0, True), ("no_point_time", 8.0, False)])
-def test_sweeps_that_tell_nothing_are_refused_in_words(
+def test_sweeps_that_are_uninformative_are_refused_as_text(
     tmp_path: Path, code: str, speed_mps: float, timed: bool
 ) -> None:
     bench = LidarBench(tmp_path)
     bench.drive(0.0, 30.0, speed_mps=speed_mps, timed=timed)
-    found = bench.reply_between(EDGE)
-    assert (found.state, [reason.code for reason in found.reasons]) == ("refused", [code])
+    result = bench.reply_between(EDGE)
+    assert (result.state, [reason.code for reason in result.reasons]) == ("refused", [code])
     assert bench.worker.stamps == []
     assert bench.states[-1].rig is not None
     bench.drive(30.0, 60.0)
     assert bench.reply_between(EDGE).state == "measured"
 
 
-def test_featureless_ground_is_refused_and_weak_directions_are_not_told(tmp_path: Path) -> None:
+def test_featureless_ground_is_refused_and_weak_directions_are_not_reported(tmp_path: Path) -> None:
     def nothing(rig: LidarRig, stamp_ns: int) -> Answer:
         wide = np.diag([*np.radians([5.0] * 3), 0.5, 0.5, 0.5]) ** 2
-        told = registration(rig, rig.T_a_b_nominal, stamp_ns)
-        return Registered(told.T_a_b, wide, told.range_bias, 0.02, 2000, 0.3, 2, ())
+        reported = registration(rig, rig.T_a_b_nominal, stamp_ns)
+        return Registered(reported.T_a_b, wide, reported.range_bias, 0.02, 2000, 0.3, 2, ())
 
     bench = LidarBench(tmp_path, nothing)
     bench.drive(0.0, 30.0)
-    found = bench.reply_between(EDGE)
-    assert [reason.code for reason in found.reasons] == ["surroundings_tell_nothing"]
-    assert found.looks == 0
+    result = bench.reply_between(EDGE)
+    assert [reason.code for reason in result.reasons] == ["surroundings_tell_nothing"]
+    assert result.looks == 0
 
 
-def test_what_cannot_be_afforded_is_said(tmp_path: Path) -> None:
+def test_what_cannot_be_afforded_is_reported(tmp_path: Path) -> None:
     bench = LidarBench(tmp_path, lidars=("roof", "bumper"), cores=0.01)
     for _ in range(9):
         bench.budget.pay(Cost(Kind.REGISTER.value, EDGE, 0.6))
@@ -199,17 +199,17 @@ def test_the_clock_of_the_sensors_steps_back(tmp_path: Path) -> None:
         pair.time_stepped_back(10 * NS)
     bench.slow = 1.0
     bench.drive(10.0, 50.0)
-    found = bench.reply_between(EDGE)
-    assert found.losses["time_stepped_back"] == 1
-    assert found.measured_ns == 32 * NS
+    result = bench.reply_between(EDGE)
+    assert result.losses["time_stepped_back"] == 1
+    assert result.measured_ns == 32 * NS
     assert bench.estimator._schedule.taken_ns >= 32 * NS + COUNTS_AFTER_NS
 
 
-def test_edges_outlive_a_restart_and_a_lidar_that_was_knocked_meanwhile_is_named(tmp_path: Path) -> None:
+def test_edges_outlive_a_restart_and_a_lidar_that_was_displaced_meanwhile_is_named(tmp_path: Path) -> None:
     bench = LidarBench(tmp_path)
-    bench.drive(0.0, KNOCKED_S)
+    bench.drive(0.0, DISPLACED_S)
     bench.estimator.finish()
     bench.estimator._disk_writer.write_due()
-    again = LidarBench(tmp_path, knocked("bumper"))
-    again.drive(KNOCKED_S, KNOCKED_S + 60.0)
+    again = LidarBench(tmp_path, displaced("bumper"))
+    again.drive(DISPLACED_S, DISPLACED_S + 60.0)
     assert states(again)["bumper"] == "lidar_moved"

@@ -13,11 +13,11 @@ PAIRS = ("front", "left", "rear")
 
 
 def _taken(order: ReportSchedule[str], *, silent: bool = False) -> list[str]:
-    found = []
-    while (said := order.take(all_are_silent=silent)) is not None:
-        found.append(said.what)
-        order.finish(said)
-    return found
+    result = []
+    while (reported := order.take(all_are_silent=silent)) is not None:
+        result.append(reported.what)
+        order.finish(reported)
+    return result
 
 
 @pytest.mark.fault("answers of several pairs overtake each other", "the rig combines them in the same order")
@@ -25,9 +25,11 @@ def _taken(order: ReportSchedule[str], *, silent: bool = False) -> list[str]:
 def test_the_order_of_arrival_changes_nothing(seed: int) -> None:
     """Each pair asks at its times, and goes on once it has its answers; how long these take is drawn."""
     rng = random.Random(seed)
-    said = {pair: [(5 * turn + 2 * place, f"{pair} {turn}") for turn in range(8)] for place, pair in enumerate(PAIRS)}
+    reported = {
+        pair: [(5 * turn + 2 * place, f"{pair} {turn}") for turn in range(8)] for place, pair in enumerate(PAIRS)
+    }
     order: ReportSchedule[str] = ReportSchedule()
-    found: list[str] = []
+    result: list[str] = []
     place = dict.fromkeys(PAIRS, 0)
     for pair in PAIRS:
         order.report_time(pair, -S, waits=False)
@@ -35,17 +37,17 @@ def test_the_order_of_arrival_changes_nothing(seed: int) -> None:
         slowest = min(place.values())
         pair = rng.choice([one for one in PAIRS if place[one] <= min(slowest + 2, 60)])
         at_s = place[pair]
-        due = [what for due_s, what in said[pair] if due_s == at_s]
+        due = [what for due_s, what in reported[pair] if due_s == at_s]
         order.report_time(pair, at_s * S, waits=bool(due))
         if rng.random() < 0.3:
-            found += _taken(order)
+            result += _taken(order)
         for what in due:
             order.put(pair, at_s * S, what)
         order.report_time(pair, at_s * S, waits=False)
         place[pair] += 1
-    found += _taken(order)
-    expected = sorted((due_s, pair, what) for pair, all_of in said.items() for due_s, what in all_of)
-    assert found == [what for _, _, what in expected]
+    result += _taken(order)
+    expected = sorted((due_s, pair, what) for pair, all_of in reported.items() for due_s, what in all_of)
+    assert result == [what for _, _, what in expected]
     assert not order.losses
 
 
@@ -110,7 +112,7 @@ def test_once_all_streams_have_stopped_everything_is_taken() -> None:
     assert _taken(order, silent=True) == ["a", "b"]
 
 
-def test_a_step_back_comes_after_what_was_said_before_it() -> None:
+def test_a_step_back_comes_after_what_was_reported_before_it() -> None:
     order: ReportSchedule[str] = ReportSchedule()
     for pair in PAIRS:
         order.report_time(pair, 100 * S, waits=False)

@@ -6,15 +6,15 @@ from itertools import permutations
 
 import pytest
 
-from coec.service.engine.schedule import Effect, ResultSchedule
+from coec.service.engine.schedule import Effect, PendingRequest, ResultSchedule
 
 
 @pytest.mark.parametrize("order", list(permutations(range(4))))
-def test_answers_are_taken_in_the_order_of_the_questions_and_act_when_they_are_due(order: tuple[int, ...]) -> None:
+def test_answers_are_taken_in_the_order_of_the_queries_and_act_when_they_are_due(order: tuple[int, ...]) -> None:
     decisions = ResultSchedule()
     taken: list[int] = []
     acted: list[int] = []
-    questions = [decisions.submit(due_ns, expires_s=1.0) for due_ns in (50, 40, 60, 60)]
+    requests = [decisions.submit(due_ns, expires_s=1.0) for due_ns in (50, 40, 60, 60)]
 
     def answer(number: int) -> Effect:
         taken.append(number)
@@ -22,7 +22,7 @@ def test_answers_are_taken_in_the_order_of_the_questions_and_act_when_they_are_d
 
     for come, number in enumerate(order):
         assert decisions.waits(60)
-        decisions.answer(questions[number], lambda number=number: answer(number))  # type: ignore[misc]
+        decisions.answer(requests[number], lambda number=number: answer(number))  # type: ignore[misc]
         assert taken == list(range(len(taken)))
         assert set(taken) <= set(order[: come + 1])
     assert taken == [0, 1, 2, 3]
@@ -45,7 +45,7 @@ def test_only_what_is_due_is_waited_for() -> None:
     assert not decisions.waits(50)
 
 
-def test_an_answer_that_was_not_awaited_acts_on_the_next_pair() -> None:
+def test_an_answer_that_was_not_pending_acts_on_the_next_pair() -> None:
     decisions = ResultSchedule()
     acted: list[int] = []
     question = decisions.submit(50, expires_s=1.0)
@@ -64,9 +64,14 @@ def test_a_question_without_an_answer_does_not_hold_up_those_behind_it() -> None
     decisions.answer(other, lambda: lambda: acted.append("other"))
     assert decisions.waits(60)
     assert decisions.expire(9.9, lambda _: lambda: None) == 0
-    told = []
-    assert decisions.expire(10.0, lambda question: told.append(question) or (lambda: lambda: acted.append("lost"))) == 1  # type: ignore[func-returns-value]
-    assert told == [lost]
+    reported = []
+
+    def on_expired(request: PendingRequest) -> Effect:
+        reported.append(request)
+        return lambda: acted.append("lost")
+
+    assert decisions.expire(10.0, on_expired) == 1
+    assert reported == [lost]
     assert not decisions.waits(10**18)
     decisions.settle(60)
     assert acted == ["lost", "other"]
@@ -75,7 +80,7 @@ def test_a_question_without_an_answer_does_not_hold_up_those_behind_it() -> None
     assert acted == ["lost", "other"], "the first answer counts"
 
 
-def test_the_question_about_a_window_is_found_until_it_is_answered() -> None:
+def test_the_query_about_a_window_is_detected_until_it_is_answered() -> None:
     decisions = ResultSchedule()
     question = decisions.submit(50, 1.0, "w-1")
     assert decisions.about("w-1") is question
@@ -87,11 +92,11 @@ def test_the_question_about_a_window_is_found_until_it_is_answered() -> None:
 def test_when_sensor_time_steps_back_whatever_waits_is_due_at_once() -> None:
     decisions = ResultSchedule()
     acted: list[int] = []
-    questions = [decisions.submit(due_ns, expires_s=1.0) for due_ns in (1000, 2000)]
+    requests = [decisions.submit(due_ns, expires_s=1.0) for due_ns in (1000, 2000)]
     assert not decisions.waits(10)
     decisions.bring_forward(10)
     assert decisions.waits(10)
-    for number, question in enumerate(questions):
+    for number, question in enumerate(requests):
         decisions.answer(question, lambda number=number: lambda: acted.append(number))  # type: ignore[misc]
     decisions.settle(10)
     assert acted == [0, 1]

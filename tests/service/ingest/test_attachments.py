@@ -30,7 +30,7 @@ FRAME = CameraFrame(5, "camera", EncodedImage(ImageFormat.MONO8, 4, 3, bytes(12)
 SENT_NS = 1_763_800_000_123_456_789
 
 
-def beside(number: int, sender: int = 1, source_ns: int = SENT_NS) -> bytes:
+def neighbour(number: int, sender: int = 1, source_ns: int = SENT_NS) -> bytes:
     """Packed by hand: number, wall clock, length of the id, id; little endian."""
     return number.to_bytes(8, "little") + source_ns.to_bytes(8, "little") + b"\x10" + bytes([sender]) * 16
 
@@ -39,7 +39,7 @@ def image(stamp_ns: int = 5) -> bytes:
     return message_encoding.encode_image(replace(FRAME, stamp_ns=stamp_ns))[1]
 
 
-class Desk:
+class Bench:
     def __init__(self) -> None:
         self.losses = LossCounter(logging.getLogger("test"), "front")
         self.decoder = Decoder(CAMERA, PAIR.camera, LimitsConfig(), self.losses)
@@ -54,44 +54,44 @@ class Desk:
 
 
 @pytest.fixture
-def desk() -> Desk:
-    return Desk()
+def bench() -> Bench:
+    return Bench()
 
 
-def test_gaps_in_the_numbers_of_a_publisher_are_loss(desk: Desk) -> None:
-    assert all(desk.take(beside(number)) for number in (1, 2, 5, *range(6, 40)))
-    assert desk.losses.snapshot() == {(CAMERA, "sequence_gap"): 2}
+def test_gaps_in_the_numbers_of_a_publisher_are_loss(bench: Bench) -> None:
+    assert all(bench.take(neighbour(number)) for number in (1, 2, 5, *range(6, 40)))
+    assert bench.losses.snapshot() == {(CAMERA, "sequence_gap"): 2}
 
 
 @pytest.mark.fault("a publisher of ROS that is started again", "no loss, and no second sender")
-def test_a_publisher_that_is_started_again_is_a_new_one(desk: Desk) -> None:
+def test_a_publisher_that_is_started_again_is_a_new_one(bench: Bench) -> None:
     for sender in (1, 2):
         for number in range(1, 30):
-            desk.take(beside(1000 * (2 - sender) + number, sender))
-    assert desk.losses.snapshot() == {}
-    assert desk.decoder.counts().taking_turns == ()
+            bench.take(neighbour(1000 * (2 - sender) + number, sender))
+    assert bench.losses.snapshot() == {}
+    assert bench.decoder.counts().taking_turns == ()
 
 
 @pytest.mark.fault(
     "two publishers on one topic of ROS",
     "their losses are counted apart, health names them, and no frame of either is used until one ends",
 )
-def test_two_publishers_at_a_time_are_told_apart_until_one_ends(desk: Desk) -> None:
+def test_two_publishers_at_a_time_are_distinguished_until_one_ends(bench: Bench) -> None:
     for number in range(1, 11):
-        desk.take(beside(number, 1))
-        desk.take(beside(500 + number, 2))
-    assert set(desk.decoder.counts().taking_turns) == {b"\1" * 16, b"\2" * 16}
-    frames = [desk.take(beside(number, 1)) for number in range(11, 80)]
-    assert not desk.decoder.counts().taking_turns
+        bench.take(neighbour(number, 1))
+        bench.take(neighbour(500 + number, 2))
+    assert set(bench.decoder.counts().taking_turns) == {b"\1" * 16, b"\2" * 16}
+    frames = [bench.take(neighbour(number, 1)) for number in range(11, 80)]
+    assert not bench.decoder.counts().taking_turns
     assert (frames[0], frames[-1]) == (None, FRAME)
-    assert set(desk.losses.snapshot()) == {(CAMERA, "two_senders")}
+    assert set(bench.losses.snapshot()) == {(CAMERA, "two_senders")}
 
 
 @pytest.mark.fault("a publisher whose numbers step back or are absurd", "frames are taken, no loss is invented")
 @pytest.mark.parametrize("numbers", [(100, 1, 2), (1, 2**63 - 1, 2), (5, 5, 5)])
-def test_numbers_that_make_no_sense_cost_nothing(desk: Desk, numbers: tuple[int, ...]) -> None:
-    assert all(desk.take(beside(number)) for number in numbers)
-    assert desk.losses.snapshot() == {}
+def test_numbers_that_make_no_sense_cost_nothing(bench: Bench, numbers: tuple[int, ...]) -> None:
+    assert all(bench.take(neighbour(number)) for number in numbers)
+    assert bench.losses.snapshot() == {}
 
 
 @pytest.mark.fault(
@@ -99,47 +99,49 @@ def test_numbers_that_make_no_sense_cost_nothing(desk: Desk, numbers: tuple[int,
 )
 @pytest.mark.parametrize(
     "attachment",
-    [b"", beside(1)[:-1], beside(1)[:16] + b"\x0f" + beside(1)[17:], b"\xff" * 33],
+    [b"", neighbour(1)[:-1], neighbour(1)[:16] + b"\x0f" + neighbour(1)[17:], b"\xff" * 33],
     ids=["empty", "short", "of another length", "negative"],
 )
-def test_what_is_no_attachment_is_counted_and_the_frame_taken(desk: Desk, attachment: bytes) -> None:
-    assert desk.take(attachment) == FRAME
-    assert desk.losses.snapshot() == {(CAMERA, "attachment_malformed"): 1}
+def test_what_is_no_attachment_is_counted_and_the_frame_taken(bench: Bench, attachment: bytes) -> None:
+    assert bench.take(attachment) == FRAME
+    assert bench.losses.snapshot() == {(CAMERA, "attachment_malformed"): 1}
 
 
-def test_a_refused_message_is_no_gap(desk: Desk) -> None:
+def test_a_refused_message_is_no_gap(bench: Bench) -> None:
     for number in range(1, 40):
-        desk.take(beside(number), b"rubbish" if number == 3 else None)
-    assert desk.losses.snapshot() == {(CAMERA, "message_malformed"): 1}
+        bench.take(neighbour(number), b"rubbish" if number == 3 else None)
+    assert bench.losses.snapshot() == {(CAMERA, "message_malformed"): 1}
 
 
-def test_an_overrun_of_a_numbered_message_is_counted_once(desk: Desk) -> None:
+def test_an_overrun_of_a_numbered_message_is_counted_once(bench: Bench) -> None:
     for number in range(1, 40):
         if number == 3:
-            desk.decoder.overrun(desk.sample(beside(number)))
+            bench.decoder.overrun(bench.sample(neighbour(number)))
         else:
-            desk.take(beside(number))
-    assert desk.losses.snapshot() == {(CAMERA, "overrun"): 1}
+            bench.take(neighbour(number))
+    assert bench.losses.snapshot() == {(CAMERA, "overrun"): 1}
 
 
-def test_the_stamp_of_the_header_is_the_truth_and_the_senders_stands_in_for_none(desk: Desk) -> None:
-    told = []
+def test_the_stamp_of_the_header_is_the_truth_and_the_senders_stands_in_for_none(bench: Bench) -> None:
+    reported = []
     for number, stamp_ns in enumerate((5, 0, 7), 1):
-        frame = desk.take(beside(number), image(stamp_ns))
+        frame = bench.take(neighbour(number), image(stamp_ns))
         assert frame is not None
-        told.append((frame.stamp_ns, desk.decoder.counts().stamped_by_sender))
-    assert told == [(5, False), (SENT_NS, True), (7, False)]
+        reported.append((frame.stamp_ns, bench.decoder.counts().stamped_by_sender))
+    assert reported == [(5, False), (SENT_NS, True), (7, False)]
 
 
-def test_a_sender_without_a_clock_leaves_the_stamp_as_it_is(desk: Desk) -> None:
-    bare = desk.take(beside(1, source_ns=0), image(stamp_ns=0))
+def test_a_sender_without_a_clock_leaves_the_stamp_as_it_is(bench: Bench) -> None:
+    bare = bench.take(neighbour(1, source_ns=0), image(stamp_ns=0))
     assert bare is not None
     assert bare.stamp_ns == 0
 
 
 @pytest.mark.fault("another type under the same topic", "refused as `wrong_type`, and the log says what was expected")
-def test_a_type_that_the_stream_does_not_take_is_refused_by_name(desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_type_that_the_stream_does_not_take_is_refused_by_name(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
     for number, type_name in enumerate(("sensor_msgs/msg/PointCloud2", "std_msgs/msg/String", "?"), 1):
-        assert desk.take(beside(number), None, f"application/cdr;{type_name}") is None
-    assert desk.losses.snapshot() == {(CAMERA, "wrong_type"): 3}
+        assert bench.take(neighbour(number), None, f"application/cdr;{type_name}") is None
+    assert bench.losses.snapshot() == {(CAMERA, "wrong_type"): 3}
     assert "/front/image_raw: expected sensor_msgs/msg/CompressedImage or sensor_msgs/msg/Image" in caplog.text

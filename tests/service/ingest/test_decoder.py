@@ -55,7 +55,7 @@ def camera(sequence: int | None = None, frame_id: str = "camera", width: int = 4
     return CameraFrame(5, frame_id, image, sequence)
 
 
-class Desk:
+class Bench:
     """Decoders and what they lost."""
 
     def __init__(self, pair: PairConfig = PAIR) -> None:
@@ -69,44 +69,44 @@ class Desk:
 
 
 @pytest.fixture
-def desk() -> Desk:
-    return Desk()
+def bench() -> Bench:
+    return Bench()
 
 
-def test_the_samples_encoding_is_believed(desk: Desk) -> None:
+def test_the_samples_encoding_is_believed(bench: Bench) -> None:
     type_name, image = message_encoding.encode_image(camera())
-    assert desk.take(CAMERA, msgpack_frames.encode_camera(camera()), MSGPACK) == camera()
-    assert desk.take(CAMERA, image, f"{CDR};{type_name}") == camera()
-    assert desk.take(CAMERA, image, CDR) == camera(), "the type of the configuration"
-    assert isinstance(desk.take(LIDAR, msgpack_frames.encode_lidar(CLOUD), MSGPACK), LidarFrame)
-    assert isinstance(desk.take(EGO, message_encoding.encode_motion(MOTION)[1], CDR), EgoMotion)
-    assert not desk.losses.snapshot()
+    assert bench.take(CAMERA, msgpack_frames.encode_camera(camera()), MSGPACK) == camera()
+    assert bench.take(CAMERA, image, f"{CDR};{type_name}") == camera()
+    assert bench.take(CAMERA, image, CDR) == camera(), "the type of the configuration"
+    assert isinstance(bench.take(LIDAR, msgpack_frames.encode_lidar(CLOUD), MSGPACK), LidarFrame)
+    assert isinstance(bench.take(EGO, message_encoding.encode_motion(MOTION)[1], CDR), EgoMotion)
+    assert not bench.losses.snapshot()
 
 
 def test_clouds_in_another_frame_come_back_to_the_lidars() -> None:
     T = ((0.0, -1.0, 0.0, 1.0), (1.0, 0.0, 0.0, 2.0), (0.0, 0.0, 1.0, 3.0), (0.0, 0.0, 0.0, 1.0))
     lidar = LidarConfig(key="l", cloud_frame_id="base_link", T_cloud_lidar=T)
-    desk = Desk(PAIR.model_copy(update={"lidar": lidar}))
+    bench = Bench(PAIR.model_copy(update={"lidar": lidar}))
     in_base = LidarFrame(5, "base_link", np.array([[1.0, 3.0, 4.0]], np.float32))
-    frame = desk.take(LIDAR, msgpack_frames.encode_lidar(in_base), MSGPACK)
+    frame = bench.take(LIDAR, msgpack_frames.encode_lidar(in_base), MSGPACK)
     assert isinstance(frame, LidarFrame)
     assert frame.frame_id == "lidar"
     np.testing.assert_array_equal(frame.xyz_m, [[1.0, 0.0, 1.0]])
-    assert desk.take(LIDAR, msgpack_frames.encode_lidar(CLOUD), MSGPACK) is None, "no frame of the configuration"
+    assert bench.take(LIDAR, msgpack_frames.encode_lidar(CLOUD), MSGPACK) is None, "no frame of the configuration"
 
 
 @pytest.mark.fault(
     "a cloud in the vehicle's frame, its origin not stated",
     "refused as `cloud_origin`, and the log says from where it looks measured",
 )
-def test_a_cloud_that_contradicts_its_origin_is_refused(desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_cloud_that_contradicts_its_origin_is_refused(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
     cloud = replace(sweep_in_frame(turning_sweep(), ROOF_POSE), frame_id="lidar")
-    assert desk.take(LIDAR, msgpack_frames.encode_lidar(cloud), MSGPACK) is None
-    assert desk.losses.snapshot() == {(LIDAR, "cloud_origin"): 1}
+    assert bench.take(LIDAR, msgpack_frames.encode_lidar(cloud), MSGPACK) is None
+    assert bench.losses.snapshot() == {(LIDAR, "cloud_origin"): 1}
     assert "look as if measured from" in caplog.text
 
 
-def test_where_points_come_from_is_looked_at_once_a_second_and_always_while_it_is_wrong(desk: Desk) -> None:
+def test_where_points_come_from_is_checked_once_a_second_and_always_while_it_is_wrong(bench: Bench) -> None:
     true, moved = (
         replace(turning_sweep(), frame_id="lidar"),
         replace(sweep_in_frame(turning_sweep(), ROOF_POSE), frame_id="lidar"),
@@ -114,32 +114,40 @@ def test_where_points_come_from_is_looked_at_once_a_second_and_always_while_it_i
 
     def taken(sweep: LidarFrame, stamp_s: float) -> bool:
         stamped = replace(sweep, stamp_ns=round(stamp_s * 1e9))
-        return desk.take(LIDAR, msgpack_frames.encode_lidar(stamped), MSGPACK) is not None
+        return bench.take(LIDAR, msgpack_frames.encode_lidar(stamped), MSGPACK) is not None
 
-    looks = [(true, 10.2), (moved, 10.3), (moved, 11.1), (moved, 11.2), (true, 11.3), (moved, 11.4), (moved, 12.0)]
-    assert [taken(*look) for look in looks] == [True, True, False, False, True, True, False]
+    observations = [
+        (true, 10.2),
+        (moved, 10.3),
+        (moved, 11.1),
+        (moved, 11.2),
+        (true, 11.3),
+        (moved, 11.4),
+        (moved, 12.0),
+    ]
+    assert [taken(*observation) for observation in observations] == [True, True, False, False, True, True, False]
 
 
 @pytest.mark.fault(
     "two LiDARs in one cloud, and no field tells them apart",
     "refused as `cloud_concatenated`, and the log says from where they look measured",
 )
-def test_a_cloud_of_two_lidars_is_refused(desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_cloud_of_two_lidars_is_refused(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
     here, there = turning_sweep(1), sweep_in_frame(turning_sweep(2), ROOF_POSE)
     assert here.ring is not None
     assert there.ring is not None
     xyz_m, ring = np.concatenate([here.xyz_m, there.xyz_m]), np.concatenate([here.ring, there.ring])
     cloud = LidarFrame(5, "lidar", xyz_m, ring=ring)
-    assert desk.take(LIDAR, msgpack_frames.encode_lidar(cloud), MSGPACK) is None
-    assert desk.losses.snapshot() == {(LIDAR, "cloud_concatenated"): 1}
+    assert bench.take(LIDAR, msgpack_frames.encode_lidar(cloud), MSGPACK) is None
+    assert bench.losses.snapshot() == {(LIDAR, "cloud_concatenated"): 1}
     assert "See lidar.source." in caplog.text
 
 
-def test_else_the_configurations(desk: Desk) -> None:
-    assert desk.take(CAMERA, msgpack_frames.encode_camera(camera())) == camera()
-    assert isinstance(desk.take(LIDAR, message_encoding.encode_cloud(CLOUD)), LidarFrame)
-    assert desk.take(EGO, msgpack_frames.encode_ego(MOTION), "text/plain") == MOTION
-    assert desk.decoders[EGO].counts().accepted == 1
+def test_else_the_configurations(bench: Bench) -> None:
+    assert bench.take(CAMERA, msgpack_frames.encode_camera(camera())) == camera()
+    assert isinstance(bench.take(LIDAR, message_encoding.encode_cloud(CLOUD)), LidarFrame)
+    assert bench.take(EGO, msgpack_frames.encode_ego(MOTION), "text/plain") == MOTION
+    assert bench.decoders[EGO].counts().accepted == 1
 
 
 @pytest.mark.parametrize(
@@ -152,53 +160,57 @@ def test_else_the_configurations(desk: Desk) -> None:
     ],
 )
 def test_what_does_not_fit_is_counted_by_reason(
-    desk: Desk, stream: str, payload: bytes, encoding: str, reason: str
+    bench: Bench, stream: str, payload: bytes, encoding: str, reason: str
 ) -> None:
-    assert desk.take(stream, payload, encoding) is None
-    assert desk.losses.snapshot() == {(stream, reason): 1}
-    assert (desk.decoders[stream].counts().received, desk.decoders[stream].counts().accepted) == (1, 0)
+    assert bench.take(stream, payload, encoding) is None
+    assert bench.losses.snapshot() == {(stream, reason): 1}
+    assert (bench.decoders[stream].counts().received, bench.decoders[stream].counts().accepted) == (1, 0)
 
 
 TF_EGO = EgoConfig(topic="/tf", type="tf2_msgs/msg/TFMessage", parent="map", child="ego")
 
 
-def test_the_motion_in_transforms_takes_two_and_what_tells_none_is_no_loss() -> None:
-    desk = Desk(PAIR.model_copy(update={"ego": TF_EGO}))
+def test_the_motion_in_transforms_takes_two_and_what_reports_none_is_no_loss() -> None:
+    bench = Bench(PAIR.model_copy(update={"ego": TF_EGO}))
     begin, end = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     messages = [
         transforms(("map", "ego", 10**9, begin)),
         transforms(("ego", "wheel", 10**9, begin)),
         transforms(("map", "ego", 10**9 + 20_000_000, end)),
     ]
-    frames = [desk.take(EGO, message, f"{CDR};tf2_msgs/msg/TFMessage") for message in messages]
+    frames = [bench.take(EGO, message, f"{CDR};tf2_msgs/msg/TFMessage") for message in messages]
     assert frames[:2] == [None, None]
     assert isinstance(frames[2], EgoMotion)
     assert frames[2].linear_mps == pytest.approx((5.0, 0.0, 0.0))
-    assert (desk.decoders[EGO].counts().received, desk.decoders[EGO].counts().accepted) == (3, 1)
-    assert not desk.losses.snapshot()
+    assert (bench.decoders[EGO].counts().received, bench.decoders[EGO].counts().accepted) == (3, 1)
+    assert not bench.losses.snapshot()
 
 
 def test_times_that_may_mean_two_things_are_counted_and_the_log_says_what_to_do(
-    desk: Desk, caplog: pytest.LogCaptureFixture
+    bench: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
     columns = [*((axis, "<f4", [1.0, 2.0]) for axis in "xyz"), ("time", "<f4", [0.0, 5.0])]
-    assert desk.take(LIDAR, packed_cloud(columns), CDR) is None
-    assert desk.losses.snapshot() == {(LIDAR, "cloud_time_ambiguous"): 1}
+    assert bench.take(LIDAR, packed_cloud(columns), CDR) is None
+    assert bench.losses.snapshot() == {(LIDAR, "cloud_time_ambiguous"): 1}
     assert "lidar.time: {field: time, unit: s, base: stamp}" in caplog.text
 
-    said = Desk(PAIR.model_copy(update={"lidar": LidarConfig(key="l", time=PointTimeConfig(field="time", unit="ms"))}))
-    frame = said.take(LIDAR, packed_cloud(columns), CDR)
+    reported = Bench(
+        PAIR.model_copy(update={"lidar": LidarConfig(key="l", time=PointTimeConfig(field="time", unit="ms"))})
+    )
+    frame = reported.take(LIDAR, packed_cloud(columns), CDR)
     assert isinstance(frame, LidarFrame)
     assert frame.time_offset_s is not None
     assert frame.time_offset_s.tolist() == pytest.approx([0.0, 0.005])
-    assert said.decoders[LIDAR].timed_by == "time: float32, ms since the stamp; 0.0 to 5.0 ms, stamped at its begin"
-    assert said.take(LIDAR, packed_cloud(columns[:3]), CDR) is None, "a field that was named has to be there"
-    assert said.losses.snapshot() == {(LIDAR, "cloud_fields"): 1}
+    assert reported.decoders[LIDAR].timed_by == "time: float32, ms since the stamp; 0.0 to 5.0 ms, stamped at its begin"
+    assert reported.take(LIDAR, packed_cloud(columns[:3]), CDR) is None, "a field that was named has to be there"
+    assert reported.losses.snapshot() == {(LIDAR, "cloud_fields"): 1}
 
 
-def test_a_type_that_people_take_for_the_right_one_is_told_apart(desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
-    assert desk.take(LIDAR, b"", f"{CDR};livox_ros_driver2/msg/CustomMsg") is None
-    assert desk.losses.snapshot() == {(LIDAR, "wrong_type"): 1}
+def test_a_type_that_people_take_for_the_right_one_is_distinguished(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert bench.take(LIDAR, b"", f"{CDR};livox_ros_driver2/msg/CustomMsg") is None
+    assert bench.losses.snapshot() == {(LIDAR, "wrong_type"): 1}
     assert "xfer_format" in caplog.text
 
 
@@ -206,24 +218,24 @@ def test_a_type_that_people_take_for_the_right_one_is_told_apart(desk: Desk, cap
 @pytest.mark.parametrize("payload", [b"", b"\xc1", b"\x80", b"\xdd\xff\xff\xff\xff", b"\x00\x01\x00\x00"])
 @pytest.mark.parametrize("encoding", [MSGPACK, CDR, f"{CDR};no_such/msg/Type", "", ";;;"])
 @pytest.mark.parametrize("stream", [CAMERA, LIDAR, EGO])
-def test_rubbish_is_counted_once(desk: Desk, stream: str, payload: bytes, encoding: str) -> None:
-    assert desk.take(stream, payload, encoding) is None
-    ((place, reason),) = desk.losses.snapshot()
+def test_rubbish_is_counted_once(bench: Bench, stream: str, payload: bytes, encoding: str) -> None:
+    assert bench.take(stream, payload, encoding) is None
+    ((place, reason),) = bench.losses.snapshot()
     assert place == stream
     assert reason != "decoder_fault"
 
 
 @pytest.mark.fault("a fault of our own in a decoder", "it costs the message only")
-def test_a_fault_of_a_decoder_costs_the_message_only(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fault_of_a_decoder_costs_the_message_only(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(msgpack_frames, "decode_ego", lambda *_: 1 // 0)
-    assert desk.take(EGO, b"", MSGPACK) is None
-    assert desk.losses.snapshot() == {(EGO, "decoder_fault"): 1}
+    assert bench.take(EGO, b"", MSGPACK) is None
+    assert bench.losses.snapshot() == {(EGO, "decoder_fault"): 1}
 
 
-def test_gaps_in_the_numbers_are_loss_but_a_new_count_is_not(desk: Desk) -> None:
+def test_gaps_in_the_numbers_are_loss_but_a_new_count_is_not(bench: Bench) -> None:
     for sequence in (7, 8, 11, 11, 0, 1, 2_000_000, 2_000_001, 2_000_002):
-        assert desk.take(CAMERA, msgpack_frames.encode_camera(camera(sequence)), MSGPACK) is not None
-    assert desk.losses.snapshot() == {(CAMERA, "sequence_gap"): 2}
+        assert bench.take(CAMERA, msgpack_frames.encode_camera(camera(sequence)), MSGPACK) is not None
+    assert bench.losses.snapshot() == {(CAMERA, "sequence_gap"): 2}
 
 
 @pytest.mark.fault(
@@ -231,27 +243,27 @@ def test_gaps_in_the_numbers_are_loss_but_a_new_count_is_not(desk: Desk) -> None
     "its frames are refused, those of the stream are used, and health says so",
 )
 @pytest.mark.parametrize("odd", [camera(5000, frame_id="other"), camera(5000, width=6)], ids=["frame id", "size"])
-def test_frames_of_another_sensor_are_not_mixed_in(desk: Desk, odd: CameraFrame) -> None:
+def test_frames_of_another_sensor_are_not_mixed_in(bench: Bench, odd: CameraFrame) -> None:
     frames = []
     for number in range(20):
-        frames.append(desk.take(CAMERA, msgpack_frames.encode_camera(camera(number)), MSGPACK))
+        frames.append(bench.take(CAMERA, msgpack_frames.encode_camera(camera(number)), MSGPACK))
         theirs = replace(odd, sequence=5000 + number)
-        assert desk.take(CAMERA, msgpack_frames.encode_camera(theirs), MSGPACK) is None
-    counts = desk.decoders[CAMERA].counts()
+        assert bench.take(CAMERA, msgpack_frames.encode_camera(theirs), MSGPACK) is None
+    counts = bench.decoders[CAMERA].counts()
     assert (None in frames, counts.foreign, counts.taking_turns) == (False, True, ())
-    assert {reason for _, reason in desk.losses.snapshot()} <= {"frame_id", "image_size"}
-    (trouble,) = stream_problems({CAMERA: counts}, PAIR, RosTopicList())
-    assert trouble.code == "foreign_frames"
+    assert {reason for _, reason in bench.losses.snapshot()} <= {"frame_id", "image_size"}
+    (problem,) = stream_problems({CAMERA: counts}, PAIR, RosTopicList())
+    assert problem.code == "foreign_frames"
     for number in range(20, 20 + RECENT):
-        desk.take(CAMERA, msgpack_frames.encode_camera(camera(number)), MSGPACK)
-    assert not desk.decoders[CAMERA].counts().foreign
+        bench.take(CAMERA, msgpack_frames.encode_camera(camera(number)), MSGPACK)
+    assert not bench.decoders[CAMERA].counts().foreign
 
 
 @pytest.mark.fault("two sources of ego-motion, each in a frame of its own", "one of them is used until it ends")
-def test_ego_motion_keeps_to_the_frame_that_it_began_with(desk: Desk) -> None:
+def test_ego_motion_keeps_to_the_frame_that_it_began_with(bench: Bench) -> None:
     def taken(frame_id: str, number: int) -> bool:
         motion = replace(MOTION, frame_id=frame_id, sequence=number)
-        return desk.take(EGO, msgpack_frames.encode_ego(motion), MSGPACK) is not None
+        return bench.take(EGO, msgpack_frames.encode_ego(motion), MSGPACK) is not None
 
     assert [(taken("base", n), taken("other", 900 + n)) for n in range(100)] == [(True, False)] * 100
     assert [taken("other", 1000 + n) for n in range(RECENT)] == [*[False] * (RECENT - 2), True, True]
@@ -281,8 +293,8 @@ def test_frames_of_two_vehicles_are_not_mixed() -> None:
         put(6971 + index, index * 10**8 + 10**7)
     counts = stream.decoder.counts()
     assert (len(counts.taking_turns), len(used)) == (2, 30)
-    (trouble,) = stream_problems({CAMERA: counts}, PAIR, RosTopicList())
-    assert (trouble.code, "refused until only one sends" in trouble.text) == ("two_senders", True)
+    (problem,) = stream_problems({CAMERA: counts}, PAIR, RosTopicList())
+    assert (problem.code, "refused until only one sends" in problem.text) == ("two_senders", True)
     assert stream.losses.snapshot() == {(CAMERA, "two_senders"): 61}
     for index in range(60, 60 + RECENT + 10):
         put(index, index * 10**8)
@@ -303,15 +315,15 @@ def test_a_sensor_that_is_started_again_loses_no_frame() -> None:
 
 
 @pytest.mark.fault("a frame that is overtaken by another", "it is counted once")
-def test_a_frame_that_was_overtaken_is_counted_once(desk: Desk) -> None:
+def test_a_frame_that_was_overtaken_is_counted_once(bench: Bench) -> None:
     """As out of order by the pairer, and not as missing by the decoder as well."""
     pairer = Pairer(PairingConfig(), expects_motion=False)
     for sequence in (1, 3, 2, *range(4, 40)):
         frame = replace(camera(sequence), stamp_ns=sequence * 10**8)
-        taken = desk.take(CAMERA, msgpack_frames.encode_camera(frame), MSGPACK)
+        taken = bench.take(CAMERA, msgpack_frames.encode_camera(frame), MSGPACK)
         assert isinstance(taken, CameraFrame)
         pairer.push(taken)
-    assert desk.losses.snapshot() == {}
+    assert bench.losses.snapshot() == {}
     assert pairer.losses["camera_stamp_back"] == 1
 
 
@@ -383,11 +395,11 @@ def test_a_call_comes_before_what_waits_and_a_waiting_reader_is_woken() -> None:
 
 
 @pytest.mark.fault("a driver that fills `ring` with one number", "the field is ignored, and the log says so once")
-def test_a_ring_that_tells_no_beams_apart_is_said_once(desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_ring_that_distinguishes_no_beams_is_reported_once(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
     sweep = turning_sweep()
     for number, ring in enumerate((sweep.ring, np.full(len(sweep.xyz_m), 7, np.uint16)) * 3):
-        told = replace(sweep, stamp_ns=(1 + 3600 * number) * 10**9, ring=ring)
-        assert desk.take(LIDAR, msgpack_frames.encode_lidar(told), MSGPACK) is not None
-    said = [message for message in caplog.messages if "`ring`" in message]
-    assert len(said) == 1
-    assert "ignored" in said[0]
+        report = replace(sweep, stamp_ns=(1 + 3600 * number) * 10**9, ring=ring)
+        assert bench.take(LIDAR, msgpack_frames.encode_lidar(report), MSGPACK) is not None
+    reported = [message for message in caplog.messages if "`ring`" in message]
+    assert len(reported) == 1
+    assert "ignored" in reported[0]

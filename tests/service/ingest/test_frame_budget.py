@@ -32,10 +32,10 @@ def test_what_is_held_anywhere_counts_until_the_last_holder_lets_go() -> None:
 
 def test_what_does_not_fit_is_refused_and_does_not_count() -> None:
     budget = FrameBudget(1000)
-    kept = sweep(50)
-    assert budget.admit(kept)
+    retained = sweep(50)
+    assert budget.admit(retained)
     assert not budget.admit(sweep(50))
-    assert budget.bytes == frame_bytes(kept)
+    assert budget.bytes == frame_bytes(retained)
     assert budget.admit(sweep(30))
     gc.collect()
     assert budget.admit(sweep(30)), "nobody has held the one before"

@@ -48,13 +48,13 @@ def rig_of(cameras: int, lidars: int, **limits: int) -> Config:
 
 
 @dataclass
-class Looks:
+class Observations:
     """In place of the chooser: what it was given, and when it ended a slice."""
 
     statistics: SelectionStatistics = field(default_factory=SelectionStatistics)
     slice_end_ns: int | None = None
     pairs: list[FramePair] = field(default_factory=list)
-    ended: list[int] = field(default_factory=list)
+    finished: list[int] = field(default_factory=list)
     waits: bool = False
     keeps: bool = True
 
@@ -68,7 +68,7 @@ class Looks:
             self.pairs.append(pair)
 
     def end_slice_by(self, now_ns: int) -> bool:
-        self.ended.append(now_ns)
+        self.finished.append(now_ns)
         self.slice_end_ns = None
         return True
 
@@ -79,26 +79,26 @@ class Vehicle:
     def __init__(self, config: Config) -> None:
         self.config = config
         self.intake = Intake(config.limits)
-        self.looks: dict[str, Looks] = {}
+        self.observations: dict[str, Observations] = {}
         self.streams: dict[str, PairStream] = {}
         for pair in config.pairs:
             self.join(pair.name)
-        self.heard: dict[str, Callable[[InputSample], None]] = {}
+        self.received: dict[str, Callable[[InputSample], None]] = {}
         self.listen()
 
     def join(self, name: str) -> None:
         (pair,) = [one for one in self.config.pairs if one.name == name]
-        self.looks[name] = Looks()
+        self.observations[name] = Observations()
         losses = LossCounter(logging.getLogger("test"), name)
-        chooser = cast("FrameSelector", self.looks[name])
-        self.streams[name] = PairStream(pair, self.config, self.intake, chooser, lambda: True, losses)
+        selector = cast("FrameSelector", self.observations[name])
+        self.streams[name] = PairStream(pair, self.config, self.intake, selector, lambda: True, losses)
 
     def listen(self) -> list[str]:
         subscribed: list[str] = []
 
         def subscribe(stream: KnownStreamConfig, take: Callable[[InputSample], None]) -> None:
             subscribed.append(stream.place)
-            self.heard[stream.place] = take
+            self.received[stream.place] = take
 
         self.intake.listen(subscribe)
         return subscribed
@@ -113,7 +113,7 @@ class Vehicle:
                 payload = encode_ego(frame)
             case bytes():
                 payload = frame
-        self.heard[key](InputSample(payload, ENCODING))
+        self.received[key](InputSample(payload, ENCODING))
 
     def settle(self) -> None:
         while self.intake.turn(0.0):
@@ -143,14 +143,14 @@ def sweep(number: int, points: int = 2) -> LidarFrame:
 
 def test_a_stream_is_listened_to_once_however_many_pairs_it_is_of() -> None:
     vehicle = Vehicle(rig_of(cameras=8, lidars=3))
-    assert sorted(vehicle.heard) == sorted([*(f"camera/{i}" for i in range(8)), *(f"lidar/{i}" for i in range(3))])
+    assert sorted(vehicle.received) == sorted([*(f"camera/{i}" for i in range(8)), *(f"lidar/{i}" for i in range(3))])
     assert vehicle.listen() == [], "once"
 
 
 def test_every_pair_gets_the_same_frame_and_it_is_counted_once() -> None:
     vehicle = Vehicle(rig_of(cameras=2, lidars=2))
     vehicle.drive(range(6), 2, 2)
-    pairs = {name: looks.pairs for name, looks in vehicle.looks.items()}
+    pairs = {name: observations.pairs for name, observations in vehicle.observations.items()}
     assert [len(each) for each in pairs.values()] == [5, 5, 5, 5], "the last may have a nearer partner still"
     for one, other in zip(pairs["0-0"], pairs["1-0"], strict=True):
         assert one.lidar is other.lidar
@@ -183,15 +183,15 @@ def test_a_pair_of_a_rig_is_given_what_it_would_be_given_alone() -> None:
         vehicle.settle()
         vehicle.streams["0-0"].finish_pairs()
 
-    def told(vehicle: Vehicle) -> list[tuple[int, int]]:
-        return [(pair.camera.stamp_ns, pair.lidar.stamp_ns) for pair in vehicle.looks["0-0"].pairs]
+    def reported(vehicle: Vehicle) -> list[tuple[int, int]]:
+        return [(pair.camera.stamp_ns, pair.lidar.stamp_ns) for pair in vehicle.observations["0-0"].pairs]
 
-    assert told(together) == told(alone)
-    assert len(told(alone)) > 25
+    assert reported(together) == reported(alone)
+    assert len(reported(alone)) > 25
     assert together.streams["0-0"].losses() == alone.streams["0-0"].losses()
 
 
-def test_what_is_lost_of_a_stream_is_counted_once_and_every_pair_of_it_tells() -> None:
+def test_what_is_lost_of_a_stream_is_counted_once_and_every_pair_of_it_reports() -> None:
     vehicle = Vehicle(rig_of(2, 1))
     vehicle.put("lidar/0", b"rubbish")
     vehicle.put("camera/0", image(0, sequence=0))
@@ -232,22 +232,22 @@ def test_a_pair_that_joins_later_gets_what_comes_then() -> None:
     vehicle.join("1-0")
     assert vehicle.listen() == ["camera/1"], "its LiDAR is listened to"
     vehicle.drive(range(5, 10), 2, 1)
-    assert [len(looks.pairs) for looks in vehicle.looks.values()] == [9, 4]
-    assert vehicle.looks["1-0"].pairs[0].lidar is vehicle.looks["0-0"].pairs[5].lidar
+    assert [len(observations.pairs) for observations in vehicle.observations.values()] == [9, 4]
+    assert vehicle.observations["1-0"].pairs[0].lidar is vehicle.observations["0-0"].pairs[5].lidar
 
 
 @pytest.mark.fault("a pair whose answers are late", "the other pairs of the vehicle are looked at meanwhile")
 def test_a_pair_that_waits_keeps_no_other_waiting(record_property: Callable[[str, object], None]) -> None:
     vehicle = Vehicle(rig_of(2, 1))
-    vehicle.looks["0-0"].waits = True
+    vehicle.observations["0-0"].waits = True
     vehicle.drive(range(30), 2, 1)
-    told = [len(looks.pairs) for looks in vehicle.looks.values()]
-    record_property("figure", f"{told[1]} of 29 pairs of the other")
-    assert told == [0, 29]
+    reported = [len(observations.pairs) for observations in vehicle.observations.values()]
+    record_property("figure", f"{reported[1]} of 29 pairs of the other")
+    assert reported == [0, 29]
     assert vehicle.streams["0-0"].report.held == 29
-    vehicle.looks["0-0"].waits = False
+    vehicle.observations["0-0"].waits = False
     vehicle.settle()
-    assert len(vehicle.looks["0-0"].pairs) == 29
+    assert len(vehicle.observations["0-0"].pairs) == 29
 
 
 @pytest.mark.fault("a sensor that floods one stream", "other streams of the vehicle lose nothing")
@@ -267,7 +267,7 @@ def test_each_stream_has_room_of_its_own(record_property: Callable[[str, object]
     }
     record_property("figure", f"{sum(lost.values())} of 500 samples of the flood, none of others")
     assert lost == {("camera/0", CAMERA, "overrun"): 500 - FRAMES_WAITING}
-    assert len(vehicle.looks["1-0"].pairs) == 9
+    assert len(vehicle.observations["1-0"].pairs) == 9
 
 
 @pytest.mark.fault("pairs that are never released", "memory of a vehicle's frames is bounded, each counted once")
@@ -281,15 +281,19 @@ def test_frames_of_all_pairs_are_bounded_together_and_each_counts_once(
         for index in range(4):
             vehicle.put(f"camera/{index}", image(number, index))
         vehicle.settle()
-    held = {id(pair.lidar): pair.lidar.xyz_m.nbytes for looks in vehicle.looks.values() for pair in looks.pairs}
+    held = {
+        id(pair.lidar): pair.lidar.xyz_m.nbytes
+        for observations in vehicle.observations.values()
+        for pair in observations.pairs
+    }
     record_property("figure", f"{sum(held.values()) / MB:.2f} MiB of 1.5 in sweeps")
     assert 1.2 * MB < sum(held.values()) <= 1.5 * MB
     (lidar,) = [sensor for sensor in vehicle.intake.sensors if sensor.kind == LIDAR]
     assert lidar.losses.snapshot()[LIDAR, "memory_full"] > 0
     held.clear()
-    for looks in vehicle.looks.values():
-        looks.pairs.clear()
-        looks.keeps = False
+    for observations in vehicle.observations.values():
+        observations.pairs.clear()
+        observations.keeps = False
     vehicle.drive(range(100, 110), 4, 1)
     gc.collect()
     before = lidar.losses.snapshot()
@@ -300,15 +304,19 @@ def test_frames_of_all_pairs_are_bounded_together_and_each_counts_once(
 @pytest.mark.fault("checks pile up before a worker that does not answer", "pairs wait no more; no frame is refused")
 def test_pairs_wait_no_more_before_frames_are_refused(record_property: Callable[[str, object], None]) -> None:
     vehicle = Vehicle(rig_of(2, 2, max_held_bytes=MB))
-    vehicle.looks["1-1"].waits, vehicle.looks["1-1"].keeps = True, False
+    vehicle.observations["1-1"].waits, vehicle.observations["1-1"].keeps = True, False
     points = 2048  # 24 kB
     for number in range(120):
         for index in range(2):
             vehicle.put(f"lidar/{index}", sweep(number, points))
             vehicle.put(f"camera/{index}", image(number, index))
         vehicle.settle()
-        kept = vehicle.looks["0-0"].pairs
-        del kept[: max(len(kept) - 45, 0)], vehicle.looks["0-1"].pairs[:], vehicle.looks["1-0"].pairs[:]
+        retained = vehicle.observations["0-0"].pairs
+        del (
+            retained[: max(len(retained) - 45, 0)],
+            vehicle.observations["0-1"].pairs[:],
+            vehicle.observations["1-0"].pairs[:],
+        )
     held = vehicle.streams["1-1"].report.held
     record_property("figure", f"{held} pairs wait instead of 42, none refused")
     assert 0 < held < 20
@@ -324,7 +332,7 @@ def test_silence_of_a_pair_is_noticed_while_others_speak(monkeypatch: pytest.Mon
     now_s = 100.0
     monkeypatch.setattr(pair_stream, "time", SimpleNamespace(monotonic=lambda: now_s))
     vehicle = Vehicle(rig_of(2, 2))
-    vehicle.looks["0-0"].slice_end_ns = vehicle.looks["1-1"].slice_end_ns = BEGIN_NS + 20 * HZ10_NS
+    vehicle.observations["0-0"].slice_end_ns = vehicle.observations["1-1"].slice_end_ns = BEGIN_NS + 20 * HZ10_NS
     for number in range(20):
         now_s += 0.1
         vehicle.drive([number], 2, 2)
@@ -336,20 +344,20 @@ def test_silence_of_a_pair_is_noticed_while_others_speak(monkeypatch: pytest.Mon
         for stream in vehicle.streams.values():
             waiting = {sensor.number for sensor in stream.sensors.values()} & vehicle.intake.inbox.waiting()
             stream.tick(waiting=bool(waiting))
-    assert vehicle.looks["0-0"].ended == [BEGIN_NS + 20 * HZ10_NS]
-    assert vehicle.looks["1-1"].ended == []
+    assert vehicle.observations["0-0"].finished == [BEGIN_NS + 20 * HZ10_NS]
+    assert vehicle.observations["1-1"].finished == []
 
 
 @pytest.mark.fault("frames that are held up for long, and come then", "the window that ended too early is counted")
 @pytest.mark.parametrize(("comes", "counted"), [(20, 1), (400, 0)])
-def test_frames_of_a_slice_that_silence_has_ended_are_counted(
+def test_frames_of_a_slice_that_silence_has_finished_are_counted(
     monkeypatch: pytest.MonkeyPatch, comes: int, counted: int
 ) -> None:
     now_s = 100.0
     monkeypatch.setattr(pair_stream, "time", SimpleNamespace(monotonic=lambda: now_s))
     vehicle = Vehicle(rig_of(1, 1))
-    looks, stream = vehicle.looks["0-0"], vehicle.streams["0-0"]
-    looks.slice_end_ns = BEGIN_NS + 50 * HZ10_NS
+    observations, stream = vehicle.observations["0-0"], vehicle.streams["0-0"]
+    observations.slice_end_ns = BEGIN_NS + 50 * HZ10_NS
     for number in range(20):
         now_s += 0.1
         vehicle.drive([number], 1, 1)
@@ -357,7 +365,7 @@ def test_frames_of_a_slice_that_silence_has_ended_are_counted(
         now_s += 0.1
         vehicle.settle()
         stream.tick(waiting=False)
-    assert looks.ended == [BEGIN_NS + 50 * HZ10_NS]
+    assert observations.finished == [BEGIN_NS + 50 * HZ10_NS]
     vehicle.drive([comes, comes + 1], 1, 1)
     assert stream.losses().get(("window", "ended_too_early"), 0) == counted
 
@@ -373,5 +381,5 @@ def test_motion_is_of_every_lidar_that_it_moves() -> None:
     for number in range(5):
         vehicle.put("odometry", EgoMotion(BEGIN_NS + number * HZ10_NS, "ego", (5.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
         vehicle.drive([number], 1, 2)
-    assert all(pair.motion is not None for looks in vehicle.looks.values() for pair in looks.pairs)
-    assert [len(looks.pairs) for looks in vehicle.looks.values()] == [4, 4]
+    assert all(pair.motion is not None for observations in vehicle.observations.values() for pair in observations.pairs)
+    assert [len(observations.pairs) for observations in vehicle.observations.values()] == [4, 4]

@@ -62,7 +62,7 @@ P = 100_000_000
 """Period of a sensor, ns."""
 
 
-def came(senders: Senders, *messages: tuple[int | None, int], origin: bytes = b"") -> int:
+def received(senders: Senders, *messages: tuple[int | None, int], origin: bytes = b"") -> int:
     """Messages as number and stamp; returns how many are known to be lost."""
     total = 0
     for number, stamp_ns in messages:
@@ -87,59 +87,59 @@ def mixed(*runs: list[tuple[int | None, int]]) -> list[tuple[int | None, int]]:
 )
 def test_two_that_number_by_themselves_are_two(first: int, stamp_ns: int) -> None:
     senders = Senders()
-    assert came(senders, *run(60, 40, 0)) == 0
-    lost = came(senders, *mixed(run(100, 12, 40 * P), run(first, 12, 40 * P + stamp_ns)))
+    assert received(senders, *run(60, 40, 0)) == 0
+    lost = received(senders, *mixed(run(100, 12, 40 * P), run(first, 12, 40 * P + stamp_ns)))
     assert len(senders.taking_turns) >= 2
     assert lost == 0
-    came(senders, *run(112, RECENT + 1, 52 * P))
+    received(senders, *run(112, RECENT + 1, 52 * P))
     assert not senders.taking_turns, "only one sends"
 
 
 def test_one_sender_whatever_happens_to_it_is_one() -> None:
     senders = Senders()
-    assert came(senders, *run(1, 50, 0)) == 0
-    assert came(senders, *run(1000, 50, 5000 * P)) == 949, "a gap"
-    assert came(senders, *run(2000, 50, 6000 * P)) == 950, "and another"
+    assert received(senders, *run(1, 50, 0)) == 0
+    assert received(senders, *run(1000, 50, 5000 * P)) == 949, "a gap"
+    assert received(senders, *run(2000, 50, 6000 * P)) == 950, "and another"
     most_lost = [(20 * index, 6050 * P + 20 * index * P) for index in range(125, 200)]
-    came(senders, *most_lost)
+    received(senders, *most_lost)
     assert senders.taking_turns == ()
-    came(senders, *run(3981, 50, most_lost[-1][1] + P))
-    assert came(senders, *run(0, 50, 61000 * P)) == 0, "a restart"
-    assert came(senders, *run(0, 50, 62000 * P)) == 0, "and another"
-    assert came(senders, *run(50, 50, 100 * P)) == 0, "a clock that steps back"
+    received(senders, *run(3981, 50, most_lost[-1][1] + P))
+    assert received(senders, *run(0, 50, 61000 * P)) == 0, "a restart"
+    assert received(senders, *run(0, 50, 62000 * P)) == 0, "and another"
+    assert received(senders, *run(50, 50, 100 * P)) == 0, "a clock that steps back"
     late = [(100, 150 * P), (103, 153 * P), (101, 151 * P), (102, 152 * P), (102, 152 * P), *run(104, 20, 154 * P)]
-    assert came(senders, *late) == 0, "messages that overtake others, and one that comes twice"
-    assert came(senders, *[(None, stamp_ns) for _, stamp_ns in run(0, 50, 200 * P)]) == 0
+    assert received(senders, *late) == 0, "messages that overtake others, and one that comes twice"
+    assert received(senders, *[(None, stamp_ns) for _, stamp_ns in run(0, 50, 200 * P)]) == 0
     assert senders.taking_turns == ()
     assert not senders.on_trial
 
 
 def test_a_restart_is_on_trial_until_it_has_sent_some() -> None:
     senders = Senders()
-    came(senders, *run(100, 20, 0))
+    received(senders, *run(100, 20, 0))
     trials = []
     for message in run(0, TRIAL + 1, 20 * P):
-        came(senders, message)
+        received(senders, message)
         trials.append(senders.on_trial)
     assert trials == [*[True] * (TRIAL - 1), False, False]
 
 
-def test_senders_without_numbers_are_told_apart_by_their_clocks() -> None:
+def test_senders_without_numbers_are_distinguished_by_their_clocks() -> None:
     senders = Senders()
     for index in range(10):
-        came(senders, (None, index * P), (None, 10**12 + index * P))
+        received(senders, (None, index * P), (None, 10**12 + index * P))
     assert len(senders.taking_turns) == 2
 
 
-def test_senders_behind_different_routers_are_told_apart_whatever_they_say() -> None:
+def test_senders_behind_different_routers_are_distinguished_whatever_they_report() -> None:
     senders = Senders()
     for index in range(10):
         for origin in (A, B):
-            came(senders, (index, index * P), origin=origin)
+            received(senders, (index, index * P), origin=origin)
     assert len(senders.taking_turns) == 2
 
 
 def test_a_flood_of_numbers_takes_no_room() -> None:
     senders = Senders()
-    came(senders, *[(number * 1000 % 7919, number) for number in range(5000)])
+    received(senders, *[(number * 1000 % 7919, number) for number in range(5000)])
     assert len(senders._tracks) <= REMEMBERED

@@ -9,8 +9,8 @@ from coec.service.ingest.decoder import LATE_FRAMES, MAX_GAP, SequenceNumbers
 
 
 def lost(*numbers: int) -> int:
-    told = SequenceNumbers()
-    return sum(told.lost_by(number) for number in numbers)
+    reported = SequenceNumbers()
+    return sum(reported.lost_by(number) for number in numbers)
 
 
 def test_a_number_that_never_comes_is_lost_once_it_is_late() -> None:
@@ -51,17 +51,17 @@ def test_what_is_sent_is_received_or_lost_in_whatever_order_it_comes(seed: int) 
 
 
 def test_a_frame_that_was_lost_here_is_no_gap_as_well() -> None:
-    told = SequenceNumbers()
-    losses = [told.lost_by(number) for number in (0, 1)]
-    told.counted()  # number 2
-    losses += [told.lost_by(number) for number in (3, 4, *range(6, 60))]
+    reported = SequenceNumbers()
+    losses = [reported.lost_by(number) for number in (0, 1)]
+    reported.counted()  # number 2
+    losses += [reported.lost_by(number) for number in (3, 4, *range(6, 60))]
     assert sum(losses) == 1, "number 5 only"
 
 
 def test_a_gap_of_much_later_is_not_taken_for_what_somebody_else_sent() -> None:
-    told = SequenceNumbers()
-    told.lost_by(0)
-    told.counted()  # it had no number
-    losses = [told.lost_by(number) for number in range(1, 100)]
-    losses += [told.lost_by(number) for number in range(101, 200)]
+    reported = SequenceNumbers()
+    reported.lost_by(0)
+    reported.counted()  # it had no number
+    losses = [reported.lost_by(number) for number in range(1, 100)]
+    losses += [reported.lost_by(number) for number in range(101, 200)]
     assert sum(losses) == 1

@@ -129,10 +129,10 @@ def test_on_a_slow_disk_a_round_is_short_and_the_list_is_there_at_once(
     longest_s = 0.0
     store.scan()
     while True:
-        before_s, told = now_s[0], digests(store)
+        before_s, reported = now_s[0], digests(store)
         if not reader.read(4 * 2**20):
             break
-        assert told == {"front-1": None}, "the list waits for no reading"
+        assert reported == {"front-1": None}, "the list waits for no reading"
         longest_s = max(longest_s, now_s[0] - before_s)
     assert longest_s < 1.0
     monkeypatch.undo()
@@ -156,9 +156,9 @@ def test_the_list_does_not_wait_for_the_index_to_be_written(
         reading = pool.submit(read_all, DigestReader(store, "front"))
         try:
             assert entered.wait(DEADLINE_S)
-            told = pool.submit(digests, store).result(DEADLINE_S / 4)
+            reported = pool.submit(digests, store).result(DEADLINE_S / 4)
             assert pool.submit(store.usage).result(DEADLINE_S / 4).used == 3 * PIECE
         finally:
             go_on.set()
         reading.result(DEADLINE_S)
-    assert told == digests(store)
+    assert reported == digests(store)

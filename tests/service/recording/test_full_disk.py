@@ -91,12 +91,12 @@ def test_a_disk_that_refuses_at_any_point_costs_that_window_only(
             disk.refuses = range(first, first + length)
             whole = life.window(10)
             refused = disk.operations > first
-            trouble = life.recorder.problem
+            problem = life.recorder.problem
             disk.refuses = ()
             assert life.window(50), f"the next window, after operation {first}"
             assert life.recorder.problem is None
             life.stop()
-        assert whole or (trouble is not None and os.strerror(error) in trouble.text)
+        assert whole or (problem is not None and os.strerror(error) in problem.text)
         assert whole or not refused or life.losses.snapshot()["window", "recording_failed"] == 1
         assert life.lost == ([] if whole else ["front-10"])
         again = WindowStore(folder / "windows", StateConfig(min_free_bytes=0))

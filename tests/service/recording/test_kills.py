@@ -36,8 +36,8 @@ def killed(folder: Path, life: int, after_s: float) -> list[str]:
         with suppress(subprocess.TimeoutExpired):
             child.wait(after_s)
         child.kill()
-        said = first + child.stdout.read()
-    return [line for line in said.decode().splitlines() if line.count(" ") == 2]
+        reported = first + child.stdout.read()
+    return [line for line in reported.decode().splitlines() if line.count(" ") == 2]
 
 
 @pytest.mark.fault(
@@ -45,14 +45,14 @@ def killed(folder: Path, life: int, after_s: float) -> list[str]:
     "all that was said to be on the disk is there to the bit, and what was cut off is salvaged",
 )
 @pytest.mark.parametrize(("kills", "seed"), [(2, 1), pytest.param(50, 2, marks=pytest.mark.slow)])
-def test_a_killed_recorder_has_all_that_it_told(
+def test_a_killed_recorder_has_all_that_it_reported(
     tmp_path: Path, kills: int, seed: int, record_property: Callable[[str, object], None]
 ) -> None:
     rng = np.random.default_rng(seed)
-    salvaged = told = 0
+    salvaged = report = 0
     for life in range(kills):
-        said = dict(line.split()[1:] for line in killed(tmp_path, life, LONGEST_S * rng.random()))
-        told += len(said)
+        reported = dict(line.split()[1:] for line in killed(tmp_path, life, LONGEST_S * rng.random()))
+        report += len(reported)
         windows, snippets = stores(tmp_path)
         before = {path.stem for path in windows.windows("front")}
         recorder, _, losses = recorder_of(windows, snippets, [])
@@ -65,9 +65,9 @@ def test_a_killed_recorder_has_all_that_it_told(
         assert set(losses.snapshot()) <= {("window", "too_few_pairs_salvaged")}
         listed = {info.window_id: str(info.sha256) for info in windows.listing("front")}
         listed |= {one.snippet_id: one.sha256 for one in snippets.listing("front")}
-        for name, sha256 in said.items():
+        for name, sha256 in reported.items():
             assert listed[name] == sha256
-        for name in listed.keys() - said.keys():
+        for name in listed.keys() - reported.keys():
             salvaged += name not in before
         for name, sha256 in listed.items():
             path = (snippets if name.endswith(".snippet") else windows).path(name)
@@ -78,5 +78,5 @@ def test_a_killed_recorder_has_all_that_it_told(
                 assert 2 <= len(read_window(path)[0].pairs) <= PAIRS
             path.unlink()
             path.with_name(f"{name}.json").unlink(missing_ok=True)
-    record_property("figure", f"{kills} kills, {told} recordings told, {salvaged} salvaged")
-    assert told >= kills
+    record_property("figure", f"{kills} kills, {report} recordings told, {salvaged} salvaged")
+    assert report >= kills

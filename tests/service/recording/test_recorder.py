@@ -127,11 +127,11 @@ def test_a_window_is_calibrated_by_what_held_when_it_began(bench: Bench) -> None
 
 def metadata_of(path: Path) -> dict[str, str]:
     """What a window says of where it comes from."""
-    found: dict[str, str] = {}
+    result: dict[str, str] = {}
     with path.open("rb") as stream:
         for record in make_reader(stream).iter_metadata():
-            found |= record.metadata
-    return found
+            result |= record.metadata
+    return result
 
 
 def test_a_window_says_by_which_settings_it_was_taken(bench: Bench) -> None:
@@ -161,11 +161,11 @@ def test_too_few_pairs_leave_no_file(bench: Bench) -> None:
 
 
 def test_a_window_takes_what_an_earlier_one_keeps_for_it_from_the_disk(bench: Bench) -> None:
-    kept = CarriedOverPairs("front-10", 20, 30, 2)
+    retained = CarriedOverPairs("front-10", 20, 30, 2)
     with bench.running():
         bench.window("front-10", [10, 20, 30])
         bench.recorder.add("front-50", pair(50), NOMINAL)
-        bench.recorder.end(SliceClosed("front-50", 3, True, kept))
+        bench.recorder.end(SliceClosed("front-50", 3, True, retained))
         names = [bench.recorded.get(timeout=DEADLINE_S)[0] for _ in range(2)]
         assert names == ["front-10", "front-50"]
     window, _ = read_window(bench.store.path("front-50"))
@@ -173,7 +173,7 @@ def test_a_window_takes_what_an_earlier_one_keeps_for_it_from_the_disk(bench: Be
     assert bench.losses.snapshot() == {}
 
 
-def test_pairs_between_are_recorded_beside_those_of_the_open_window_and_do_not_count(bench: Bench) -> None:
+def test_pairs_between_are_recorded_next_to_those_of_the_open_window_and_do_not_count(bench: Bench) -> None:
     with bench.running():
         bench.recorder.add_between("front-10", pair(5))
         bench.recorder.add("front-10", pair(10), NOMINAL)
@@ -194,7 +194,7 @@ def test_pairs_between_are_recorded_beside_those_of_the_open_window_and_do_not_c
 @pytest.mark.fault(
     "a window is gone whose last pairs the next window is to hold", "the loss is counted, the next is kept"
 )
-def test_kept_pairs_that_are_gone_are_counted_and_cost_no_window(bench: Bench) -> None:
+def test_retained_pairs_that_are_gone_are_counted_and_cost_no_window(bench: Bench) -> None:
     with bench.running():
         for name, stamps in (("front-50", [50, 60]), ("front-70", [70])):
             for stamp_ns in stamps:
@@ -274,7 +274,7 @@ def test_a_full_disk_costs_one_window_and_the_next_is_tried(bench: Bench, monkey
 
 
 @pytest.mark.fault("a disk that is nearly full", "no window begins below the free space asked for")
-def test_no_window_starts_below_the_free_space_asked_for(tmp_path: Path) -> None:
+def test_no_window_starts_below_the_free_space_requested(tmp_path: Path) -> None:
     bench = Bench(store_of(tmp_path, min_free_bytes=2**62))
     with bench.running():
         bench.window("front-10", [10, 20])
@@ -312,7 +312,7 @@ def test_leftovers_are_salvaged_and_unsolved_windows_resumed_newest_first(tmp_pa
 
 
 @pytest.mark.fault("a disk that refuses a window", "health says why until one can be written again")
-def test_trouble_is_told_in_the_words_of_the_disk_until_what_follows_can_be_written(
+def test_problem_is_reported_in_the_text_of_the_disk_until_what_follows_can_be_written(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = os.fdatasync
@@ -361,7 +361,7 @@ def test_a_window_cannot_be_removed_while_it_is_handed_over(tmp_path: Path) -> N
     assert not path.exists()
 
 
-def test_windows_that_nobody_reported_are_read_beside_the_work(tmp_path: Path) -> None:
+def test_windows_that_nobody_reported_are_read_next_to_the_work(tmp_path: Path) -> None:
     store = store_of(tmp_path)
     for start in (100, 200):
         writer = WindowWriter(store.path(f"front-{start}"), RIG, NOMINAL, f"front-{start}", CalibrationConfig(), {})
@@ -389,7 +389,7 @@ def test_a_stop_does_not_wait_for_windows_that_are_being_read(tmp_path: Path) ->
 
 
 @pytest.mark.fault("a disk that never lets go of the recorder", "this is reported, and the stop goes on")
-def test_a_thread_that_the_disk_does_not_let_go_is_told(tmp_path: Path) -> None:
+def test_a_thread_that_the_disk_does_not_let_go_is_reported(tmp_path: Path) -> None:
     recorder = Bench(store_of(tmp_path)).recorder
     assert recorder.problem is None
     recorder.thread._beat_s -= STUCK_S + 1.0  # since the last sign of life

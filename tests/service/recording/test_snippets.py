@@ -155,26 +155,26 @@ def test_what_a_killed_service_left_is_taken_up(tmp_path: Path, record_property:
     part = path.with_name(f"{path.name}.part")
     killed_here = part.read_bytes()
     file.abandon()
-    found = []
+    result = []
     for share in (0.0, 0.3, 0.6, 1.0):
         part.write_bytes(killed_here[: round(share * len(killed_here))])
         again = Bench(tmp_path)
         again.recorder.resume(lambda: None)
         assert not part.exists()
-        told = {info.snippet_id: info for info in again.store.listing("front")}
-        assert told.pop(untold.snippet_id) == untold
+        reported = {info.snippet_id: info for info in again.store.listing("front")}
+        assert reported.pop(untold.snippet_id) == untold
         if share == 0.0:
-            assert not told
+            assert not reported
             continue
-        (info,) = told.values()
+        (info,) = reported.values()
         assert info.event == "degraded"
-        found.append(read_recording(path).counts["/front/lidar/points"])
+        result.append(read_recording(path).counts["/front/lidar/points"])
         assert Bench(tmp_path).store.listing("front") == again.store.listing("front"), "now it is told"
         path.unlink()
         (bench.folder / f"{info.snippet_id}.json").unlink()
-    record_property("figure", f"{found} of 10 sweeps by the place of the cut")
-    assert found == sorted(found)
-    assert found[-1] >= 6
+    record_property("figure", f"{result} of 10 sweeps by the place of the cut")
+    assert result == sorted(result)
+    assert result[-1] >= 6
 
 
 @pytest.mark.fault("a disk that is full at any write of a snippet", "it is lost and counted, and the next is written")

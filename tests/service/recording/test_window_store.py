@@ -186,32 +186,32 @@ def test_evidence_is_the_last_to_go_and_never_for_its_age(tmp_path: Path) -> Non
     assert stems(store) == [at(202)]
 
 
-def test_what_is_kept_is_said_and_bounded_the_oldest_first(tmp_path: Path) -> None:
+def test_what_is_retained_is_reported_and_bounded_the_oldest_first(tmp_path: Path) -> None:
     store = store_of(tmp_path, max_bytes=2**20, max_protected_bytes=250_000)
     for day in range(4):
         record(store, at(day), bytes(100_000), age_days=400 - day)
     record(store, at(400), bytes(100_000))
 
-    def kept_for() -> list[str | None]:
+    def retained_for() -> list[str | None]:
         return [info.kept_for for info in store.listing("front")]
 
     store.protect("front", {at(0): "commissioning", at(1): "commissioning", at(2): "red_event"})
-    assert kept_for() == [None, "commissioning", "red_event", None, None]
+    assert retained_for() == [None, "commissioning", "red_event", None, None]
     store.note(at(2), version_of(store.path(at(2)), decision="failed"))
-    assert kept_for() == [None, "commissioning", "red_event", None, None]
+    assert retained_for() == [None, "commissioning", "red_event", None, None]
     make_room(store)
     assert stems(store) == [at(1), at(2), at(400)], "what is kept beyond the bound goes for its age like any other"
     store.reconfigure(StateConfig(max_protected_bytes=0, min_free_bytes=0))
-    assert kept_for() == [None, None, None]
+    assert retained_for() == [None, None, None]
 
 
-def test_progress_is_told_with_every_window_that_goes(tmp_path: Path) -> None:
+def test_progress_is_reported_with_every_window_that_goes(tmp_path: Path) -> None:
     store = store_of(tmp_path, max_bytes=2**20)
     for day in range(9):
         record(store, at(day), bytes(400_000))
-    told: list[int] = []
-    store.make_room(lambda: told.append(1))
-    assert len(told) == store.removed == 8
+    reported: list[int] = []
+    store.make_room(lambda: reported.append(1))
+    assert len(reported) == store.removed == 8
 
 
 @pytest.mark.fault("somebody removes the folder of windows", "it is made again")
@@ -403,11 +403,11 @@ def test_the_list_does_not_wait_for_windows_to_be_removed(tmp_path: Path, monkey
         removing = pool.submit(make_room, store)
         try:
             assert entered.wait(DEADLINE_S)
-            told = pool.submit(store.listing, "front").result(DEADLINE_S / 4)
+            reported = pool.submit(store.listing, "front").result(DEADLINE_S / 4)
             store.hold("front-2")  # a question about it has come meanwhile
         finally:
             go_on.set()
         removing.result(DEADLINE_S)
-    assert [info.window_id for info in told] == ["front-2", "front-3"]
+    assert [info.window_id for info in reported] == ["front-2", "front-3"]
     assert [path.stem for path in store.windows("front")] == ["front-2", "front-3"]
     assert store.removed == 1

@@ -47,7 +47,7 @@ def test_a_restart_finds_the_same_checks_and_goes_on(tmp_path: Path) -> None:
     assert CheckLog(tmp_path / "checks", 10).checks() == again.checks()
 
 
-def test_the_newest_are_kept_and_the_file_stays_bounded(tmp_path: Path) -> None:
+def test_the_newest_are_retained_and_the_file_stays_bounded(tmp_path: Path) -> None:
     log = CheckLog(tmp_path / "checks", 3)
     for stamp_ns in range(20):
         log.append(check(stamp_ns))

@@ -36,9 +36,9 @@ def written(path: Path, count: int, limit: int = 100) -> HashChain:
 
 
 def test_every_entry_holds_the_hash_of_the_one_before(tmp_path: Path) -> None:
-    kept = written(tmp_path / "h", 4).entries()
+    retained = written(tmp_path / "h", 4).entries()
     previous = GENESIS
-    for number, item in enumerate(kept):
+    for number, item in enumerate(retained):
         assert (item.entry.sequence, item.entry.previous_sha256) == (number, previous)
         assert item.sha256 == hashlib.sha256(to_json(item.entry)).hexdigest()
         if item.result is not None:
@@ -51,11 +51,11 @@ def test_a_restart_finds_the_same_chain_and_goes_on(tmp_path: Path) -> None:
     again = HashChain(tmp_path / "h", 100, before.durable_head)
     assert again.damage is None
     assert again.entries() == before.entries()
-    assert [kept.result for kept in again.entries()] == [None, result(1), None, result(3)]
+    assert [retained.result for retained in again.entries()] == [None, result(1), None, result(3)]
     assert again.append(entry()).entry.previous_sha256 == before.entries()[-1].sha256
 
 
-def test_the_newest_are_kept_and_the_file_stays_bounded(tmp_path: Path) -> None:
+def test_the_newest_are_retained_and_the_file_stays_bounded(tmp_path: Path) -> None:
     history = written(tmp_path / "h", 20, limit=3)
     assert [item.entry.sequence for item in history.entries()] == [17, 18, 19]
     assert len((tmp_path / "h").read_bytes().splitlines()) <= 6
@@ -68,7 +68,7 @@ def test_the_newest_are_kept_and_the_file_stays_bounded(tmp_path: Path) -> None:
     "an entry of the history changed, removed, swapped or put in", "it is noticed, and the file kept aside"
 )
 @pytest.mark.parametrize("what", ["text", "result", "removed", "swapped", "inserted"])
-def test_any_change_is_noticed_and_the_file_kept_aside(tmp_path: Path, what: str) -> None:
+def test_any_change_is_noticed_and_the_file_quarantined(tmp_path: Path, what: str) -> None:
     path = tmp_path / "h"
     head = written(path, 5).durable_head
     original = path.read_bytes()
@@ -149,14 +149,14 @@ def test_another_entry_at_the_place_of_the_head_is_noticed(tmp_path: Path) -> No
 def append_line(path: Path, entry_fields: dict[str, object], result_fields: dict[str, object] | None = None) -> bytes:
     """Appends an entry as another version of the software would."""
     last = path.read_bytes().splitlines()[-1]
-    told = b"null" if result_fields is None else json.dumps(result_fields).encode()
+    reported = b"null" if result_fields is None else json.dumps(result_fields).encode()
     fields: dict[str, object] = {
         "sequence": json.loads(last.partition(b" ")[2].partition(b"\t")[0])["sequence"] + 1,
         "previous_sha256": last.partition(b" ")[0].decode(),
-        "result_sha256": None if result_fields is None else hashlib.sha256(told).hexdigest(),
+        "result_sha256": None if result_fields is None else hashlib.sha256(reported).hexdigest(),
     }
     document = json.dumps(fields | entry_fields).encode()
-    line = hashlib.sha256(document).hexdigest().encode() + b" " + document + b"\t" + told
+    line = hashlib.sha256(document).hexdigest().encode() + b" " + document + b"\t" + reported
     with path.open("ab") as stream:
         stream.write(line + b"\n")
     return line
@@ -228,11 +228,11 @@ class Life:
     def __init__(self, root: Path) -> None:
         self.history = HashChain(root / "h", LIMIT)
         self.state = StateFile(root / "state.json")
-        self.said = 0
+        self.message = 0
 
     def append(self) -> int | None:
         """One entry more, then the state: the number of the entry if both say that it is safe."""
-        number, self.said = self.said, self.said + 1
+        number, self.message = self.message, self.message + 1
         self.history.append(entry(str(number)))
         try:
             self.history.flush()
@@ -249,11 +249,11 @@ def assert_restarts(root: Path, safe: int) -> None:
     body = StateFile(root / "state.json").load().body
     again = HashChain(root / "h", LIMIT, body["head"] if body else None)
     assert again.damage is None
-    found = [int(kept.entry.text) for kept in again.entries()]
-    assert found == list(range(found[0], found[-1] + 1)) if found else safe == -1
-    if found:
-        assert found[-1] >= safe
-        assert found[0] <= max(0, found[-1] - LIMIT + 1)
+    detected = [int(retained.entry.text) for retained in again.entries()]
+    assert detected == list(range(detected[0], detected[-1] + 1)) if detected else safe == -1
+    if detected:
+        assert detected[-1] >= safe
+        assert detected[0] <= max(0, detected[-1] - LIMIT + 1)
 
 
 @pytest.mark.fault(
@@ -296,7 +296,7 @@ def test_what_waits_is_written_without_another_entry_and_the_head_follows(
     for _ in range(2):
         with pytest.raises(StateError, match="No space"):
             history.flush()
-    assert [kept.entry.text for kept in history.entries()] == ["0", "1", "third"]
+    assert [retained.entry.text for retained in history.entries()] == ["0", "1", "third"]
     assert history.durable_head == before
     disk.refuses = ()
     history.flush()
@@ -306,7 +306,7 @@ def test_what_waits_is_written_without_another_entry_and_the_head_follows(
     assert again.entries() == history.entries()
 
 
-def test_a_broken_chain_is_kept_aside_once_the_disk_takes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_broken_chain_is_quarantined_once_the_disk_takes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     disk = Disk(tmp_path, monkeypatch)
     path = tmp_path / "h"
     written(path, 3)
@@ -320,7 +320,7 @@ def test_a_broken_chain_is_kept_aside_once_the_disk_takes_it(tmp_path: Path, mon
     history.append(entry("on"))
     history.flush()
     assert (tmp_path / "h.broken").read_bytes() == broken
-    assert [kept.entry.text for kept in HashChain(path, 100, history.durable_head).entries()] == ["0", "on"]
+    assert [retained.entry.text for retained in HashChain(path, 100, history.durable_head).entries()] == ["0", "on"]
 
 
 def test_a_history_that_cannot_be_read_is_damage(tmp_path: Path) -> None:

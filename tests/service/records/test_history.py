@@ -61,7 +61,7 @@ def test_no_flood_pushes_a_result_or_what_it_put_in_place_out(tmp_path: Path, fl
     for one in (history, PairHistory(tmp_path, "front", LIMIT, history.durable_heads)):
         assert one.damage is None
         assert one.results() == (result,)
-        assert [kept.entry.code for kept in one.entries()] == ["accepted", "estimated", *[flood.code] * LIMIT]
+        assert [retained.entry.code for retained in one.entries()] == ["accepted", "estimated", *[flood.code] * LIMIT]
 
 
 def test_a_window_that_is_solved_again_and_again_displaces_no_other(tmp_path: Path) -> None:
@@ -75,7 +75,7 @@ def test_a_window_that_is_solved_again_and_again_displaces_no_other(tmp_path: Pa
     assert next(one.entry.window_id for one in history.entries() if one.entry.kind == "extrinsic") == result.window_id
 
 
-def test_entries_are_numbered_together_in_the_order_in_which_they_came(tmp_path: Path) -> None:
+def test_entries_are_numbered_together_in_the_order_in_which_they_arrived(tmp_path: Path) -> None:
     kinds = ["command", "state", "command", "commissioned", "state"]
     history, _ = filled(tmp_path)
     for kind in kinds[:3]:
@@ -84,8 +84,8 @@ def test_entries_are_numbered_together_in_the_order_in_which_they_came(tmp_path:
     history = PairHistory(tmp_path, "front", LIMIT, history.durable_heads)
     for kind in kinds[3:]:
         history.append(entry(kind))
-    told = [(kept.entry.sequence, kept.entry.kind) for kept in history.entries()]
-    assert told == list(enumerate(["estimate", "extrinsic", *kinds]))
+    reported = [(retained.entry.sequence, retained.entry.kind) for retained in history.entries()]
+    assert reported == list(enumerate(["estimate", "extrinsic", *kinds]))
 
 
 @pytest.mark.parametrize("book", ["history", "commands", "states"])
@@ -106,7 +106,7 @@ def test_a_forged_pose_in_a_book_is_damage_whatever_its_hash(tmp_path: Path) -> 
     history.flush()
     again = PairHistory(tmp_path, "front", LIMIT, {})
     assert again.damage is not None
-    assert [kept.entry.code for kept in again.entries()] == ["accepted", "estimated"]
+    assert [retained.entry.code for retained in again.entries()] == ["accepted", "estimated"]
 
 
 @pytest.mark.fault("a full disk under all three books of the history", "each waits, and is written when there is room")

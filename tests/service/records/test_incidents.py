@@ -34,7 +34,7 @@ def point(stamp: int) -> MetricsPoint:
     return MetricsPoint(stamp_ns=stamp, state="healthy", metrics={"mi": 0.5, "f1": None})
 
 
-def found(evidence: Incidents, event_id: str) -> EvidenceEvent:
+def result(evidence: Incidents, event_id: str) -> EvidenceEvent:
     return next(each for each in evidence.events() if each.event_id == event_id)
 
 
@@ -45,7 +45,7 @@ def test_an_event_holds_the_figures_before_and_after_it(tmp_path: Path) -> None:
     evidence.begin(event(1000))
     for stamp in range(1001, 1001 + POINTS_AFTER + 20):
         evidence.note(point(stamp))
-    stamps = [p.stamp_ns for p in found(evidence, "front-1000").metrics]
+    stamps = [p.stamp_ns for p in result(evidence, "front-1000").metrics]
     assert stamps == [*range(10, POINTS_BEFORE + 10), *range(1001, 1001 + POINTS_AFTER)]
 
 
@@ -62,9 +62,9 @@ def test_windows_pictures_and_the_end_are_added_and_survive_a_restart(tmp_path: 
     assert evidence.overlay("front-1000", "after") == b"jpeg"
     evidence.flush()
     again = Incidents(tmp_path, "front", 3)
-    kept = found(again, "front-1000")
-    assert (kept.window_before, kept.window_after, kept.overlays) == ("front-1", "front-2", ("after",))
-    assert (kept.resolved_stamp_ns, kept.resolution) == (2000, "healthy: corrected")
+    retained = result(again, "front-1000")
+    assert (retained.window_before, retained.window_after, retained.overlays) == ("front-1", "front-2", ("after",))
+    assert (retained.resolved_stamp_ns, retained.resolution) == (2000, "healthy: corrected")
     assert again.overlay("front-1000", "after") == b"jpeg"
     assert again.window_ids == {"front-1", "front-2"}
     with pytest.raises(NotFoundError, match="no picture"):
@@ -100,11 +100,11 @@ def test_a_disk_that_cannot_be_written_costs_evidence_only(tmp_path: Path) -> No
     evidence.begin(event(1000))
     with pytest.raises(StateError, match="evidence"):
         evidence.flush()
-    assert found(evidence, "front-1000").window_before == "front-1"
+    assert result(evidence, "front-1000").window_before == "front-1"
     (tmp_path / "evidence").unlink()
     evidence.note(point(1001))
     evidence.flush()
-    assert found(Incidents(tmp_path / "evidence", "front", 2), "front-1000").metrics == (point(1001),)
+    assert result(Incidents(tmp_path / "evidence", "front", 2), "front-1000").metrics == (point(1001),)
 
 
 def test_an_event_that_could_not_be_written_is_written_later_however_late(
@@ -120,7 +120,7 @@ def test_an_event_that_could_not_be_written_is_written_later_however_late(
             evidence.flush()
     disk.refuses = ()
     evidence.flush()
-    assert len(found(Incidents(tmp_path, "front", 2), "front-1000").metrics) == POINTS_AFTER
+    assert len(result(Incidents(tmp_path, "front", 2), "front-1000").metrics) == POINTS_AFTER
 
 
 def test_half_an_event_of_a_power_cut_is_removed_and_too_many_are_bounded_at_the_start(tmp_path: Path) -> None:
@@ -165,15 +165,15 @@ def test_a_power_cut_at_any_byte_takes_no_evidence_that_was_written(
     for count, cut in enumerate(disk.power_cuts()):
         again = Incidents(cut.restore(tmp_path / str(count)), "front", 2)
         done = len(cut.acknowledged)
-        found = {each.event_id: each for each in again.events()}
-        wanted = {"front-1": 0 < done < 5, "front-2": done >= 5, "front-3": done >= 6}
-        assert {event_id for event_id, needed in wanted.items() if needed} <= set(found)
-        if first := found.get("front-1"):
+        result = {each.event_id: each for each in again.events()}
+        expected = {"front-1": 0 < done < 5, "front-2": done >= 5, "front-3": done >= 6}
+        assert {event_id for event_id, needed in expected.items() if needed} <= set(result)
+        if first := result.get("front-1"):
             assert first.overlays or done < 2
             assert not first.overlays or again.overlay("front-1", "before") == b"a picture" or done >= 5
             assert first.window_after == "front-2" or done < 3
             assert first.resolution == "healthy" or done < 4
-        assert len(found) <= 2
+        assert len(result) <= 2
     assert count > 1000
 
 

@@ -30,7 +30,7 @@ def _driven() -> tuple[VehicleRig, float]:
     return drive.state, drive.at_s
 
 
-def knocked() -> RigDrive:
+def displaced() -> RigDrive:
     """The LiDAR was knocked and named; one of its cameras has seen nothing for more than a minute."""
     drive = RigDrive(graph(STAR))
     drive.state, drive.at_s = _driven()
@@ -41,9 +41,9 @@ def restarted(rig: VehicleRig, folder: Path) -> VehicleRig:
     file = RigStore(folder)
     file.update(rig)
     file.flush()
-    found = RigStore(folder)
-    assert found.damage == ()
-    return found.restored(rig_estimator.initial_rig(rig.graph, rig.serves, rig.windows))
+    result = RigStore(folder)
+    assert result.damage == ()
+    return result.restored(rig_estimator.initial_rig(rig.graph, rig.serves, rig.windows))
 
 
 def put_right(drive: RigDrive) -> Matrix4:
@@ -57,43 +57,43 @@ def put_right(drive: RigDrive) -> Matrix4:
 
 @pytest.mark.fault("a kill between the knock of a LiDAR and its correction", "the correction is the same after it")
 def test_what_was_known_before_a_move_outlives_a_restart(tmp_path: Path) -> None:
-    without, with_restart = knocked(), knocked()
+    without, with_restart = displaced(), displaced()
     with_restart.state = restarted(with_restart.state, tmp_path)
-    told = put_right(with_restart)
-    assert told.tobytes() == put_right(without).tobytes()
-    away = se3.difference(told, pose_of(without.state.graph.edge[BLIND], AFTER))
+    reported = put_right(with_restart)
+    assert reported.tobytes() == put_right(without).tobytes()
+    away = se3.difference(reported, pose_of(without.state.graph.edge[BLIND], AFTER))
     assert np.degrees(np.abs(away[:3]).max()) < 0.2, "of 1°"
 
 
 def test_what_was_known_is_the_same_to_the_bit(tmp_path: Path) -> None:
-    rig = knocked().state
+    rig = displaced().state
     again = restarted(rig, tmp_path)
     assert rig.before is not None
     assert again.before is not None
     assert again.before.sensors == rig.before.sensors
     assert set(again.before.edges) == set(rig.before.edges)
     for name, known in rig.before.edges.items():
-        found = again.before.edges[name]
-        assert found.T_camera_lidar.tobytes() == known.T_camera_lidar.tobytes()
-        assert found.uncertainty.noise.tobytes() == known.uncertainty.noise.tobytes()
-        assert {key: shift.tobytes() for key, shift in found.uncertainty.systematic.items()} == {
+        result = again.before.edges[name]
+        assert result.T_camera_lidar.tobytes() == known.T_camera_lidar.tobytes()
+        assert result.uncertainty.noise.tobytes() == known.uncertainty.noise.tobytes()
+        assert {key: shift.tobytes() for key, shift in result.uncertainty.systematic.items()} == {
             key: shift.tobytes() for key, shift in known.uncertainty.systematic.items()
         }
-        assert found.stamp_ns == known.stamp_ns
+        assert result.stamp_ns == known.stamp_ns
 
 
 def test_pairs_that_join_one_after_the_other_find_what_was_known_of_them(tmp_path: Path) -> None:
-    rig = knocked().state
+    rig = displaced().state
     file = RigStore(tmp_path)
     file.update(rig)
     file.flush()
-    found = RigStore(tmp_path)
+    result = RigStore(tmp_path)
     grown: VehicleRig | None = None
     for count in (2, 3):
         part = graph(STAR[:count])
         serves = {name: rig.serves[name] for name in part.edge}
         windows = {name: one for name, one in rig.windows.items() if name in part.edge}
-        fresh = found.restored(rig_estimator.initial_rig(part, serves, windows))
+        fresh = result.restored(rig_estimator.initial_rig(part, serves, windows))
         grown = fresh if grown is None else rig_estimator.grown(grown, fresh)
     assert grown is not None
     assert grown.before is not None
@@ -105,7 +105,7 @@ def test_a_file_that_somebody_removed_is_written_again(tmp_path: Path, changed: 
     file = RigStore(tmp_path)
     file.flush()
     assert not (tmp_path / RIG_FILE).exists(), "there is nothing to remember"
-    file.update(knocked().state)
+    file.update(displaced().state)
     file.flush()
     before = (tmp_path / RIG_FILE).read_bytes()
     if not changed:

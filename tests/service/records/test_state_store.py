@@ -61,13 +61,13 @@ def test_a_state_comes_back_bit_for_bit(tmp_path: Path) -> None:
     assert back.failures == (Reason("worker_failed", "crash"),)
     assert back.latest is not None
     assert back.accepted is not None
-    for kept, made in ((back.latest, estimate(2, Decision.FAILED)), (back.accepted, estimate(1))):
-        assert result_of(kept, ESTIMATE_RIG, "test") == result_of(made, ESTIMATE_RIG, "test")
-        assert np.array_equal(kept.correction, made.correction)
+    for retained, made in ((back.latest, estimate(2, Decision.FAILED)), (back.accepted, estimate(1))):
+        assert result_of(retained, ESTIMATE_RIG, "test") == result_of(made, ESTIMATE_RIG, "test")
+        assert np.array_equal(retained.correction, made.correction)
     assert (back.health, back.reasons, back.proven) == (HealthState.HEALTHY, (), True)
 
 
-def test_what_was_known_before_nobody_looked_comes_back(tmp_path: Path) -> None:
+def test_what_was_known_before_nobody_checked_comes_back(tmp_path: Path) -> None:
     late = overdue(
         after_estimate(initial_state(ESTIMATE_RIG), estimate(1), 0, RULES), Reason("overdue_worker", "No answer.")
     )
@@ -80,8 +80,8 @@ def test_what_was_known_before_nobody_looked_comes_back(tmp_path: Path) -> None:
 def test_what_waits_and_what_was_seen_come_back_to_the_byte(tmp_path: Path) -> None:
     hold = ExtrinsicHold(7, "operator", "the mirror is being changed")
     state = held(after_estimate(initial_state(ESTIMATE_RIG), estimate(1), 0, NEVER), hold)
-    belief = OffsetPosterior((1 / 3, 0.1, -0.0), (1e-9, 0.2, 0.3), 0.7)
-    tests = Hypotheses(belief, (Hypothesis(1, 2.5, 1 / 7, belief, belief, belief),), (0.1, 0.2, 0.3))
+    posterior = OffsetPosterior((1 / 3, 0.1, -0.0), (1e-9, 0.2, 0.3), 0.7)
+    tests = Hypotheses(posterior, (Hypothesis(1, 2.5, 1 / 7, posterior, posterior, posterior),), (0.1, 0.2, 0.3))
     monitor = MonitorState(
         MonitorOutcome.SUSPECT, tests, Hypotheses(), {"dark": 0.1}, {"40": 2.5}, 0.5, (5, 6), stood=True
     )

@@ -41,22 +41,22 @@ def frames(ros: RosConfig | None = None) -> CalibratedFrames:
 
 @pytest.mark.parametrize("provenance", ["commissioned", "estimated", "restored"])
 def test_the_camera_is_a_child_of_the_lidar_at_the_inverse_of_what_is_served(provenance: Provenance) -> None:
-    told = frames().transforms([served(provenance)])
+    reported = frames().transforms([served(provenance)])
 
-    (placed,) = told.placed
+    (placed,) = reported.placed
     assert (placed.parent, placed.child) == ("lidar", "camera_calibrated")
     assert np.allclose(placed.T_parent_child @ POSE, np.eye(4), atol=1e-15)
-    assert told.texts == {"front": f"camera_calibrated in lidar, {provenance}"}
+    assert reported.texts == {"front": f"camera_calibrated in lidar, {provenance}"}
 
 
 def test_nothing_is_called_calibrated_while_it_is_nominal() -> None:
-    told = frames().transforms([served("nominal")])
+    reported = frames().transforms([served("nominal")])
 
-    assert told.placed == ()
-    assert told.texts == {"front": "not published: nominal still"}
+    assert reported.placed == ()
+    assert reported.texts == {"front": "not published: nominal still"}
 
 
-def test_after_a_reset_whoever_heard_of_the_frame_hears_what_is_served_now() -> None:
+def test_after_a_reset_whoever_received_of_the_frame_receives_what_is_served_now() -> None:
     own = frames()
     own.transforms([served("estimated")])
 
@@ -65,19 +65,19 @@ def test_after_a_reset_whoever_heard_of_the_frame_hears_what_is_served_now() -> 
     assert np.array_equal(placed.T_parent_child, np.eye(4))
 
 
-def test_the_cameras_own_frame_is_replaced_only_where_that_is_wanted_and_then_always() -> None:
-    told = frames(RosConfig(replace_camera_frames=True)).transforms([served("nominal")])
+def test_the_cameras_own_frame_is_replaced_only_where_that_is_requested_and_then_always() -> None:
+    reported = frames(RosConfig(replace_camera_frames=True)).transforms([served("nominal")])
 
-    assert [(placed.parent, placed.child) for placed in told.placed] == [("lidar", "camera")]
+    assert [(placed.parent, placed.child) for placed in reported.placed] == [("lidar", "camera")]
 
 
 def test_a_camera_of_two_pairs_has_a_calibrated_frame_for_each_and_none_of_its_own() -> None:
     pairs = [served("estimated", "front-top", lidar="top"), served("estimated", "2nd", lidar="bumper")]
 
-    beside = frames().transforms(pairs)
+    neighbour = frames().transforms(pairs)
     replacing = frames(RosConfig(replace_camera_frames=True)).transforms(pairs)
 
-    assert [(placed.parent, placed.child) for placed in beside.placed] == [
+    assert [(placed.parent, placed.child) for placed in neighbour.placed] == [
         ("top", "camera_front_top_calibrated"),
         ("bumper", "camera__2nd_calibrated"),
     ]
@@ -94,6 +94,6 @@ def test_frames_are_named_as_tf2_has_them() -> None:
 
 
 def test_no_frame_is_its_own_parent() -> None:
-    told = frames(RosConfig(calibrated_suffix="_lidar")).transforms([served("estimated", lidar="camera_lidar")])
+    reported = frames(RosConfig(calibrated_suffix="_lidar")).transforms([served("estimated", lidar="camera_lidar")])
 
-    assert told.placed == ()
+    assert reported.placed == ()

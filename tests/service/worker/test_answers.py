@@ -119,7 +119,7 @@ def test_a_commissioning_and_a_picture_survive() -> None:
     assert returned(RenderedImage(b"\xff\xd8jpeg"), Kind.OVERLAY) == RenderedImage(b"\xff\xd8jpeg")
 
 
-def test_a_refusal_is_told_whatever_was_asked_and_a_prefetch_is_answered_with_nothing() -> None:
+def test_a_refusal_is_reported_whatever_was_requested_and_a_prefetch_is_answered_with_nothing() -> None:
     refusal = over_the_wire(pack_refusal(9, Reason("bad_window", "empty")))
     assert number_of(refusal) == 9
     for kind in (*Kind, None):
@@ -204,7 +204,7 @@ def test_what_is_no_check_is_malformed(result: object) -> None:
         (None, {"jpeg": b""}),
     ],
 )
-def test_what_is_no_answer_to_what_was_asked_is_malformed(kind: Kind | None, result: object) -> None:
+def test_what_is_no_answer_to_what_was_requested_is_malformed(kind: Kind | None, result: object) -> None:
     with pytest.raises(MalformedAnswerError):
         read_answer(over_the_wire({"id": 3, "result": result}), kind)
 

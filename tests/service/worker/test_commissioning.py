@@ -66,9 +66,9 @@ def paths(street: Window, tmp_path: Path) -> list[Path]:
 
 def slices(solver: Solver, street: Window, paths: list[Path], run: int = 1) -> Iterator[Underway | Commissioned]:
     while True:
-        told = solver.commission(run, CONFIG, street.T_camera_lidar_start.tolist(), paths)
-        yield told
-        if isinstance(told, Commissioned):
+        reported = solver.commission(run, CONFIG, street.T_camera_lidar_start.tolist(), paths)
+        yield reported
+        if isinstance(reported, Commissioned):
             return
 
 
@@ -78,31 +78,31 @@ def test_a_baseline_learned_between_checks_is_the_one_learned_without_a_pause(
 ) -> None:
     checked = pack_pairs(street.pairs[:4])
     stages: list[str] = []
-    for told in slices(solver, street, paths):
+    for reported in slices(solver, street, paths):
         if len(stages) % 5 == 0:
             solver.observe(street.rig.pair, CONFIG, street.T_camera_lidar_start.tolist(), checked)
-        if isinstance(told, Underway):
-            stages.append(str(told))
-    assert isinstance(told, Commissioned)
+        if isinstance(reported, Underway):
+            stages.append(str(reported))
+    assert isinstance(reported, Commissioned)
     assert stages[:2] == ["windows 1 of 2", "windows 2 of 2"]
     assert {"depth 8 of 8", "spread 3 of 3", "right 4 of 4", "far 1 of 1", "verdicts 2 of 2"} <= set(stages)
     windows = [replace(street, pairs=street.pairs[number::2]) for number in (0, 1)]
     depth, images = solver._network(CONFIG.depth), GreyImages(LimitsConfig())
     whole = commission(windows, depth, images, CONFIG, sensors={}, reference=street.T_camera_lidar_start)
-    assert told.baseline_hash == baseline_hash(whole)
+    assert reported.baseline_hash == baseline_hash(whole)
     saved = load_baseline(tmp_path / BASELINES, street.rig.pair)
     assert saved is not None
-    assert baseline_hash(saved) == told.baseline_hash
+    assert baseline_hash(saved) == reported.baseline_hash
 
 
-def test_another_commissioning_takes_the_place_of_one_that_was_begun(
+def test_another_commissioning_takes_the_place_of_one_that_was_started(
     solver: Solver, street: Window, paths: list[Path]
 ) -> None:
-    begun = slices(solver, street, paths, run=1)
-    assert [str(next(begun)), str(next(begun))] == ["windows 1 of 2", "windows 2 of 2"]
+    started = slices(solver, street, paths, run=1)
+    assert [str(next(started)), str(next(started))] == ["windows 1 of 2", "windows 2 of 2"]
     other = slices(solver, street, paths, run=2)
     assert str(next(other)) == "windows 1 of 2"
-    assert str(next(begun)) == "windows 1 of 2", "the first one begins again"
+    assert str(next(started)) == "windows 1 of 2", "the first one begins again"
 
 
 def test_after_an_error_nothing_is_left(solver: Solver, street: Window, paths: list[Path], tmp_path: Path) -> None:

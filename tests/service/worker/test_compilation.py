@@ -101,7 +101,7 @@ def test_the_log_says_how_far_it_is_at_a_bounded_rate(caplog: pytest.LogCaptureF
     ]
 
 
-def test_the_worker_reports_when_it_begins_a_kernel_at_a_bounded_rate_and_when_it_has_ended_it(
+def test_the_worker_reports_when_it_begins_a_kernel_at_a_bounded_rate_and_when_it_has_finished_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clock, sent = Clock(), Sent()

@@ -59,7 +59,7 @@ def ends(queue: JobQueue) -> list[tuple[str, Fate, str | None]]:
     return [(job.subject, o.fate, o.reason.code if o.reason else None) for job, o in queue.drain()]
 
 
-def asked(jobs: Iterable[WorkerJob], attempts: int = 2) -> JobQueue:
+def requested(jobs: Iterable[WorkerJob], attempts: int = 2) -> JobQueue:
     queue = JobQueue(attempts)
     for job in jobs:
         queue.submit(job, 0.0)
@@ -79,7 +79,7 @@ def subject_of(ticket: Ticket | None) -> str:
     return ticket.work.subject if isinstance(ticket.work, WorkerJob) else "prefetch"
 
 
-def test_a_job_ends_with_its_answer_and_the_time_since_it_was_asked() -> None:
+def test_a_job_ends_with_its_answer_and_the_time_since_it_was_requested() -> None:
     queue = JobQueue(2)
     job = a_job("a")
     queue.submit(job, 10.0)
@@ -90,15 +90,15 @@ def test_a_job_ends_with_its_answer_and_the_time_since_it_was_asked() -> None:
     assert progress is not None
     assert (progress.kind, progress.pair, progress.subject, progress.age_s) == ("solve", "front", "a", 0.5)
     queue.answered(ANSWER, 12.0)
-    ((ended, outcome),) = queue.drain()
-    assert ended is job
+    ((finished, outcome),) = queue.drain()
+    assert finished is job
     assert (outcome.fate, outcome.answer, outcome.reason, outcome.elapsed_s) == (Fate.RESULT, ANSWER, None, 2.0)
     assert queue.in_progress(13.0) is None
     assert (queue.outcomes, queue.causes) == ({Fate.RESULT: 1}, {})
 
 
 def test_numbers_are_never_used_again() -> None:
-    queue = asked([a_job("a")], attempts=3)
+    queue = requested([a_job("a")], attempts=3)
     numbers = []
     for _ in range(3):
         ticket = queue.take(0.0)
@@ -109,7 +109,7 @@ def test_numbers_are_never_used_again() -> None:
 
 
 def test_checks_go_first_then_windows_errands_prefetches_the_backlog_and_commissionings() -> None:
-    queue = asked(
+    queue = requested(
         [a_job("old", live=False), a_job("picture", Kind.OVERLAY), a_job("baseline", Kind.COMMISSION), a_job("window")]
     )
     queue.prefetch(Prefetch("front", b""))
@@ -122,8 +122,8 @@ def test_checks_go_first_then_windows_errands_prefetches_the_backlog_and_commiss
     assert order == ["check", "window", "picture", "prefetch", "old", "baseline"]
 
 
-def test_a_window_that_checks_have_kept_waiting_goes_before_them() -> None:
-    queue = asked([a_job("window")])
+def test_a_window_that_checks_have_retained_waiting_goes_before_them() -> None:
+    queue = requested([a_job("window")])
     for second in (0.0, 4.0, 8.0):
         queue.submit(check(f"check {second:.0f}", "rear"), second)
     order = []
@@ -135,7 +135,7 @@ def test_a_window_that_checks_have_kept_waiting_goes_before_them() -> None:
 
 @pytest.mark.fault("`commission` while the pair is watched", "checks and windows go before every slice of it")
 def test_a_commissioning_goes_on_only_when_nothing_else_waits() -> None:
-    queue = asked([a_job("baseline", Kind.COMMISSION)])
+    queue = requested([a_job("baseline", Kind.COMMISSION)])
     assert queue.commissionings == {"front": None}
     order = []
     for number in range(1, 4):
@@ -156,7 +156,7 @@ def test_a_commissioning_goes_on_only_when_nothing_else_waits() -> None:
 
 
 def test_a_pair_has_one_commissioning_and_those_of_several_pairs_follow_each_other() -> None:
-    queue = asked([a_job("front", Kind.COMMISSION), a_job("left", Kind.COMMISSION, "left")])
+    queue = requested([a_job("front", Kind.COMMISSION), a_job("left", Kind.COMMISSION, "left")])
     queue.submit(a_job("waiting already", Kind.COMMISSION), 0.0)
     assert begin(queue) == "front"
     queue.submit(a_job("begun already", Kind.COMMISSION), 0.0)
@@ -169,7 +169,7 @@ def test_a_pair_has_one_commissioning_and_those_of_several_pairs_follow_each_oth
 
 
 def test_a_commissioning_begins_again_when_the_worker_dies_of_something_else() -> None:
-    queue = asked([a_job("baseline", Kind.COMMISSION)])
+    queue = requested([a_job("baseline", Kind.COMMISSION)])
     begin(queue)
     queue.answered(Underway("spread", 4, 10), 0.0)
     queue.submit(check("deadly"), 0.0)
@@ -182,7 +182,7 @@ def test_a_commissioning_begins_again_when_the_worker_dies_of_something_else() -
 
 
 def test_a_commissioning_that_never_comes_to_its_end_is_given_up() -> None:
-    queue = asked([a_job("baseline", Kind.COMMISSION)])
+    queue = requested([a_job("baseline", Kind.COMMISSION)])
     begin(queue)
     queue.answered(Underway("spread", 1, 10), 0.0)
     queue.expire(DEADLINE_S[Kind.COMMISSION])
@@ -191,7 +191,7 @@ def test_a_commissioning_that_never_comes_to_its_end_is_given_up() -> None:
 
 
 def test_the_newest_checks_and_windows_of_a_pair_stay_and_pairs_do_not_push_each_other_out() -> None:
-    queue = asked([a_job("w0"), a_job("left-0", pair="left"), a_job("w1"), a_job("w2"), check("other", "left")])
+    queue = requested([a_job("w0"), a_job("left-0", pair="left"), a_job("w1"), a_job("w2"), check("other", "left")])
     assert ends(queue) == [("w0", Fate.SUPERSEDED, "superseded")]
     for number in range(WAITING[Lane.CHECK] + 1):
         queue.submit(check(f"c{number}"), 0.0)
@@ -203,7 +203,7 @@ def test_the_newest_checks_and_windows_of_a_pair_stay_and_pairs_do_not_push_each
     ("lane", "kind", "live"), [(Lane.ERRAND, Kind.OVERLAY, True), (Lane.BACKLOG, Kind.SOLVE, False)]
 )
 def test_of_the_rest_the_oldest_stay(lane: Lane, kind: Kind, live: bool) -> None:
-    queue = asked(a_job(str(number), kind, live=live) for number in range(WAITING[lane] + 1))
+    queue = requested(a_job(str(number), kind, live=live) for number in range(WAITING[lane] + 1))
     assert ends(queue) == [(str(WAITING[lane]), Fate.FAILED, "busy")]
     queue.submit(a_job("left", kind, "left", live), 0.0)
     assert ends(queue) == []
@@ -224,7 +224,7 @@ def test_prefetches_are_bounded_and_the_oldest_go() -> None:
 
 
 def test_a_window_is_tried_again_until_it_has_had_its_attempts() -> None:
-    queue = asked([a_job("a"), a_job("b")], attempts=2)
+    queue = requested([a_job("a"), a_job("b")], attempts=2)
     assert begin(queue) == "a"
     queue.died("was ended by signal 9", 1.0)
     assert ends(queue) == []
@@ -239,7 +239,7 @@ def test_a_window_is_tried_again_until_it_has_had_its_attempts() -> None:
 
 
 def test_a_window_that_could_not_be_sent_has_had_no_attempt() -> None:
-    queue = asked([a_job("a")], attempts=1)
+    queue = requested([a_job("a")], attempts=1)
     for _ in range(5):
         assert subject_of(queue.take(0.0)) == "a"
         queue.died("broke the connection", 0.0)
@@ -251,7 +251,7 @@ def test_a_window_that_could_not_be_sent_has_had_no_attempt() -> None:
 
 @pytest.mark.parametrize("kind", [Kind.CHECK, Kind.OVERLAY, Kind.COMMISSION, Kind.REGISTER])
 def test_other_work_is_done_once_or_not_at_all_and_sent_at_most_twice(kind: Kind) -> None:
-    queue = asked([a_job("begun", kind), a_job("unsent", kind, "left")])
+    queue = requested([a_job("begun", kind), a_job("unsent", kind, "left")])
     begin(queue)
     queue.died("was ended by signal 9", 0.0)
     assert ends(queue) == [("begun", Fate.FAILED, "worker_failed")]
@@ -264,7 +264,7 @@ def test_other_work_is_done_once_or_not_at_all_and_sent_at_most_twice(kind: Kind
 
 
 def test_a_window_that_comes_back_gives_way_to_newer_ones() -> None:
-    queue = asked([a_job("a")])
+    queue = requested([a_job("a")])
     begin(queue)
     for name in "bc":
         queue.submit(a_job(name), 0.0)
@@ -273,7 +273,7 @@ def test_a_window_that_comes_back_gives_way_to_newer_ones() -> None:
 
 
 def test_an_errand_that_comes_back_to_a_full_room_has_failed() -> None:
-    queue = asked([a_job("a", Kind.OVERLAY)])
+    queue = requested([a_job("a", Kind.OVERLAY)])
     queue.take(0.0)
     for number in range(WAITING[Lane.ERRAND]):
         queue.submit(a_job(str(number), Kind.OVERLAY), 0.0)
@@ -282,7 +282,7 @@ def test_an_errand_that_comes_back_to_a_full_room_has_failed() -> None:
 
 
 def test_checks_that_kill_let_windows_go_first_until_one_is_answered() -> None:
-    queue = asked([check("c0"), check("c1"), check("c2"), a_job("a"), a_job("b")])
+    queue = requested([check("c0"), check("c1"), check("c2"), a_job("a"), a_job("b")])
     assert begin(queue) == "c0"
     queue.died("died", 0.0)
     assert begin(queue) == "a"
@@ -296,7 +296,7 @@ def test_checks_that_kill_let_windows_go_first_until_one_is_answered() -> None:
 
 
 def test_a_job_is_answered_when_its_deadline_passes() -> None:
-    queue = asked([a_job("a", deadline_s=5.0), check("c"), a_job("b")])
+    queue = requested([a_job("a", deadline_s=5.0), check("c"), a_job("b")])
     queue.expire(4.9)
     assert ends(queue) == []
     queue.expire(5.0)
@@ -309,7 +309,7 @@ def test_a_job_is_answered_when_its_deadline_passes() -> None:
 
 @pytest.mark.parametrize("end", ["answer", "death"])
 def test_a_job_that_is_late_with_the_worker_is_answered_and_stays_with_it(end: str) -> None:
-    queue = asked([a_job("a", deadline_s=5.0), a_job("b")])
+    queue = requested([a_job("a", deadline_s=5.0), a_job("b")])
     begin(queue)
     queue.expire(6.0)
     ((_, outcome),) = queue.drain()
@@ -325,7 +325,7 @@ def test_a_job_that_is_late_with_the_worker_is_answered_and_stays_with_it(end: s
 
 
 def test_at_a_stop_everything_is_answered_and_nothing_more_is_done() -> None:
-    queue = asked([check("c"), a_job("a"), a_job("old", live=False), a_job("picture", Kind.OVERLAY)])
+    queue = requested([check("c"), a_job("a"), a_job("old", live=False), a_job("picture", Kind.OVERLAY)])
     queue.prefetch(Prefetch("front", b""))
     begin(queue)
     queue.stop(1.0)
@@ -342,7 +342,7 @@ def test_at_a_stop_everything_is_answered_and_nothing_more_is_done() -> None:
 
 
 def test_the_worker_has_one_thing_at_a_time() -> None:
-    queue = asked([a_job("a"), a_job("b")])
+    queue = requested([a_job("a"), a_job("b")])
     queue.take(0.0)
     with pytest.raises(ValueError, match="the worker is not idle"):
         queue.take(0.0)
@@ -350,9 +350,9 @@ def test_the_worker_has_one_thing_at_a_time() -> None:
     with pytest.raises(ValueError, match="finished without a result"):
         queue.answered(None, 0.0)
     with pytest.raises(ValueError, match="internal error: no job is assigned to the worker"):
-        asked([a_job("a")]).sent(0.0)
+        requested([a_job("a")]).sent(0.0)
     with pytest.raises(ValueError, match="internal error: no job is assigned to the worker"):
-        asked([a_job("a")]).answered(ANSWER, 0.0)
+        requested([a_job("a")]).answered(ANSWER, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -381,9 +381,9 @@ class Followed:
     """A job as the model knows it."""
 
     job: WorkerJob
-    asked_s: float
+    requested_s: float
     outcomes: list[JobOutcome] = field(default_factory=list)
-    begun: int = 0
+    started: int = 0
     unsent: int = 0
 
     @property
@@ -396,7 +396,7 @@ class Followed:
 
     @property
     def due_s(self) -> float:
-        return self.asked_s + self.job.patience_s
+        return self.requested_s + self.job.patience_s
 
 
 class QueueMachine(RuleBasedStateMachine):
@@ -428,7 +428,7 @@ class QueueMachine(RuleBasedStateMachine):
         deadline_s=st.sampled_from([None, None, None, 1.0, 3.0, 10.0]),
         times=st.sampled_from([1, 1, 1, 3, 70]),
     )
-    def ask(self, kind: Kind, pair: str, live: bool, deadline_s: float | None, times: int) -> None:
+    def query(self, kind: Kind, pair: str, live: bool, deadline_s: float | None, times: int) -> None:
         for _ in range(times):
             made = Followed(
                 a_job(str(len(self.jobs)), kind, pair, live or kind is not Kind.SOLVE, deadline_s), self.now_s
@@ -490,7 +490,7 @@ class QueueMachine(RuleBasedStateMachine):
         self.queue.sent(self.now_s)
         self.was_sent = True
         if self.hand is not None:
-            self.hand.begun += 1
+            self.hand.started += 1
 
     @precondition(lambda self: not self.is_idle and self.was_sent)
     @rule(refused=st.booleans())
@@ -531,7 +531,7 @@ class QueueMachine(RuleBasedStateMachine):
             return
         job.unsent += not self.was_sent
         if job.job.kind is Kind.SOLVE:
-            again = job.begun < self.attempts or not self.was_sent
+            again = job.started < self.attempts or not self.was_sent
         else:
             again = not self.was_sent and job.unsent == 1
         room = [other for other in self.waiting if (other.lane, other.job.pair) == (job.lane, job.job.pair)]
@@ -596,7 +596,7 @@ class QueueMachine(RuleBasedStateMachine):
         assert len(job.outcomes) == 1, job.job.subject
         (outcome,) = job.outcomes
         assert (outcome.fate, outcome.reason.code if outcome.reason else None) == (fate, code)
-        assert outcome.elapsed_s == self.now_s - job.asked_s
+        assert outcome.elapsed_s == self.now_s - job.requested_s
 
     def collect(self) -> None:
         for job, outcome in self.queue.drain():
@@ -605,14 +605,14 @@ class QueueMachine(RuleBasedStateMachine):
     # --- what holds -------------------------------------------------------------------------------------------------
 
     @invariant()
-    def every_job_waits_is_with_the_worker_or_has_ended_once(self) -> None:
+    def every_job_waits_is_with_the_worker_or_has_finished_once(self) -> None:
         self.collect()
         waiting = set(self.waiting)
         for job in self.jobs:
             pending = job in waiting or (job is self.hand and not job.outcomes)
             assert len(job.outcomes) == (0 if pending else 1)
             if job.job.kind is not Kind.COMMISSION:
-                assert job.begun <= (self.attempts if job.job.kind is Kind.SOLVE else 1)
+                assert job.started <= (self.attempts if job.job.kind is Kind.SOLVE else 1)
 
     @invariant()
     def the_room_is_bounded(self) -> None:
@@ -622,7 +622,7 @@ class QueueMachine(RuleBasedStateMachine):
         assert all(count <= WAITING[lane] for (lane, _), count in rooms.items())
 
     @invariant()
-    def what_has_ended_is_counted(self) -> None:
+    def what_has_finished_is_counted(self) -> None:
         outcomes = [outcome for job in self.jobs for outcome in job.outcomes]
         assert self.queue.outcomes == dict(Counter(outcome.fate for outcome in outcomes))
         codes = Counter(outcome.reason.code for outcome in outcomes if outcome.reason is not None)

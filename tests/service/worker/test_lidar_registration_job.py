@@ -67,21 +67,21 @@ def solver() -> Solver:
 
 def test_a_question_carries_both_lidars_and_their_sweeps() -> None:
     pair = replace(sweeps(), motion=MOTION)
-    asked = question(pair, sweeps())
-    found = unpack_sweeps(asked["frames"], LimitsConfig())
-    np.testing.assert_array_equal(found[0].b.xyz_m, pair.b.xyz_m)
-    assert (found[0].motion, found[1].motion) == (MOTION, None)
-    rig = structured(wire_form(), asked["lidars"], LidarRig)
+    requested = question(pair, sweeps())
+    result = unpack_sweeps(requested["frames"], LimitsConfig())
+    np.testing.assert_array_equal(result[0].b.xyz_m, pair.b.xyz_m)
+    assert (result[0].motion, result[1].motion) == (MOTION, None)
+    rig = structured(wire_form(), requested["lidars"], LidarRig)
     np.testing.assert_array_equal(rig.T_a_b_nominal, T_A_B)
     assert (rig.a, rig.b, rig.sweep_a, rig.sweep_b) == ("roof", "bumper", None, RIG.sweep_b)
 
 
 def test_the_worker_finds_the_pose(solver: Solver) -> None:
     pytest.importorskip("small_gicp", reason="the extra `lidars` is not installed")
-    found = read_answer(answer_request(solver, question(sweeps())), Kind.REGISTER)
-    assert isinstance(found, Registered)
-    assert found.reasons == ()
-    assert np.abs(se3.difference(found.T_a_b, T_A_B)).max() < 0.02
+    result = read_answer(answer_request(solver, question(sweeps())), Kind.REGISTER)
+    assert isinstance(result, Registered)
+    assert result.reasons == ()
+    assert np.abs(se3.difference(result.T_a_b, T_A_B)).max() < 0.02
 
 
 HOSTILE = {
@@ -101,9 +101,9 @@ def test_hostile_clouds_are_answered(solver: Solver, name: str) -> None:
     pytest.importorskip("small_gicp", reason="the extra `lidars` is not installed")
     with np.errstate(over="ignore"):
         for pair in (sweeps(HOSTILE[name]), replace(sweeps(), a=sweeps(HOSTILE[name]).b)):
-            found = read_answer(answer_request(solver, question(pair)), Kind.REGISTER)
-            assert isinstance(found, Registered | Reason)
-            assert isinstance(found, Reason) or found.reasons
+            result = read_answer(answer_request(solver, question(pair)), Kind.REGISTER)
+            assert isinstance(result, Registered | Reason)
+            assert isinstance(result, Reason) or result.reasons
 
 
 def test_without_the_extra_the_answer_says_what_to_install(solver: Solver, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,21 +111,21 @@ def test_without_the_extra_the_answer_says_what_to_install(solver: Solver, monke
         raise SourceError("LiDARs are registered with the optional extra `lidars`")
 
     monkeypatch.setattr(tasks, "Trees", absent)
-    found = read_answer(answer_request(solver, question(sweeps())), Kind.REGISTER)
-    assert isinstance(found, Reason)
-    assert "extra `lidars`" in found.text
+    result = read_answer(answer_request(solver, question(sweeps())), Kind.REGISTER)
+    assert isinstance(result, Reason)
+    assert "extra `lidars`" in result.text
 
 
 GOOD = Registered(T_A_B, np.eye(6) / 7, RangeBias(0.01, 0.002), float("nan"), 700, 0.3, 2, (Reason("a", "b"),))
 
 
 def test_an_answer_comes_back_to_the_bit() -> None:
-    found = read_answer(pack_answer(1, GOOD), Kind.REGISTER)
-    assert isinstance(found, Registered)
-    np.testing.assert_array_equal(found.T_a_b, GOOD.T_a_b)
-    np.testing.assert_array_equal(found.covariance, GOOD.covariance)
-    bias = found.range_bias
-    assert (bias.longer_m, bias.sigma_m, found.points, found.reasons) == (0.01, 0.002, 700, GOOD.reasons)
+    result = read_answer(pack_answer(1, GOOD), Kind.REGISTER)
+    assert isinstance(result, Registered)
+    np.testing.assert_array_equal(result.T_a_b, GOOD.T_a_b)
+    np.testing.assert_array_equal(result.covariance, GOOD.covariance)
+    bias = result.range_bias
+    assert (bias.longer_m, bias.sigma_m, result.points, result.reasons) == (0.01, 0.002, 700, GOOD.reasons)
 
 
 @pytest.mark.parametrize(
@@ -146,9 +146,9 @@ def test_an_answer_that_is_none_is_refused(bad: Registered) -> None:
     "the worker is killed while it registers two LiDARs", "answered once, with the reason; windows go on"
 )
 def test_a_worker_that_is_killed_ends_the_registration() -> None:
-    ended: list[JobOutcome] = []
+    finished: list[JobOutcome] = []
     queue = JobQueue(attempts=2)
-    queue.submit(register("roof to bumper", RIG, [sweeps()], ended.append), 0.0)
+    queue.submit(register("roof to bumper", RIG, [sweeps()], finished.append), 0.0)
     assert queue.take(0.0) is not None
     queue.sent(0.0)
     queue.died("was ended by signal 9", 1.0)

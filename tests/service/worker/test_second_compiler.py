@@ -46,7 +46,7 @@ def test_there_is_one_from_the_first_kernel_to_the_end_of_the_warm_up(started: l
     assert child.returncode is not None
 
 
-def test_there_is_none_beside_a_single_processor(
+def test_there_is_none_next_to_a_single_processor(
     started: list[subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})

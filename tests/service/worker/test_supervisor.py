@@ -54,12 +54,12 @@ class Bench:
 
     worker: Worker
     folder: Path
-    told: queue.SimpleQueue[tuple[str, JobOutcome]] = field(default_factory=queue.SimpleQueue)
+    reported: queue.SimpleQueue[tuple[str, JobOutcome]] = field(default_factory=queue.SimpleQueue)
     jobs: list[str] = field(default_factory=list)
 
     def done(self, name: str) -> Callable[[JobOutcome], None]:
         self.jobs.append(name)
-        return lambda outcome: self.told.put((name, outcome))
+        return lambda outcome: self.reported.put((name, outcome))
 
     def solve(self, name: str, pair: str = "front", live: bool = True) -> None:
         self.worker.submit(worker_jobs.solve(pair, Path("/windows") / name, name, self.done(name), live))
@@ -72,7 +72,7 @@ class Bench:
 
     def outcome(self) -> tuple[str, JobOutcome]:
         """The next one that is told."""
-        return self.told.get(timeout=DEADLINE_S)
+        return self.reported.get(timeout=DEADLINE_S)
 
     def answer(self) -> tuple[str, Any]:
         """The next outcome, which is a result: whose, and the id of its window or what else was answered."""
@@ -158,7 +158,7 @@ def test_a_worker_that_takes_the_place_of_another_has_the_latest_configuration(t
 # --- what it costs ----------------------------------------------------------------------------------------------------
 
 
-def test_all_processor_time_is_told_by_what_it_was_for(tmp_path: Path) -> None:
+def test_all_processor_time_is_reported_by_what_it_was_for(tmp_path: Path) -> None:
     """Of a process that is new, of each job before its outcome, and of one that dies with its job."""
     (tmp_path / RESULT_FILE).write_bytes(to_msgpack(result_of(estimate(1), ESTIMATE_RIG, "test")))
     costs: list[Cost] = []
@@ -363,14 +363,14 @@ def test_a_window_that_no_worker_survives_is_given_up_and_the_service_goes_on(
         assert it.answer()[0] == "c"
 
 
-def test_what_is_said_twice_answers_no_other_question(tmp_path: Path) -> None:
+def test_what_is_reported_twice_answers_no_other_query(tmp_path: Path) -> None:
     with running("twice-once", tmp_path, at="overlay") as it:
         for name in "abc":
             it.overlay(name)
-        told = dict(it.outcome() for _ in range(3))
-        assert told["a"].answer == RenderedImage(b"a")
+        reported = dict(it.outcome() for _ in range(3))
+        assert reported["a"].answer == RenderedImage(b"a")
         for name in "bc":
-            answer, reason = told[name].answer, told[name].reason
+            answer, reason = reported[name].answer, reported[name].reason
             assert answer == RenderedImage(name.encode()) or (reason is not None and reason.code == "worker_failed")
         assert it.faults() == {Fault.STRAY_ANSWER: 1}
 
@@ -506,8 +506,8 @@ def test_a_stop_does_not_wait_for_a_solve_and_answers_all_that_waits(tmp_path: P
         it.check("c")
         pid = it.worker.pid
         it.worker.request_stop()
-        told = {it.outcome()[0]: None for _ in range(3)}
-        assert set(told) == {"a", "b", "c"}
+        reported = {it.outcome()[0]: None for _ in range(3)}
+        assert set(reported) == {"a", "b", "c"}
         it.solve("too late")
         name, reason = it.failure()
         assert (name, reason.code) == ("too late", "stopping")
@@ -535,19 +535,19 @@ def test_whoever_fails_to_take_an_outcome_harms_nobody_else(tmp_path: Path, capl
     assert "nobody is at home" in caplog.text
 
 
-def test_an_outcome_is_told_without_a_lock(tmp_path: Path) -> None:
+def test_an_outcome_is_reported_without_a_lock(tmp_path: Path) -> None:
     """Whoever is told may ask for more, and so may others while he is told."""
     statuses: queue.SimpleQueue[WorkerState] = queue.SimpleQueue()
     with running("none", tmp_path) as it:
 
-        def told(_: JobOutcome) -> None:
+        def reported(_: JobOutcome) -> None:
             asker = ServiceThread("asker", lambda _: statuses.put(it.worker.status().state))
             asker.start()
             assert asker.join(DEADLINE_S)
             it.overlay("next")
 
         it.jobs.append("first")
-        it.worker.submit(worker_jobs.overlay("front", Path("a"), POSE, "first", told))
+        it.worker.submit(worker_jobs.overlay("front", Path("a"), POSE, "first", reported))
         assert it.answer() == ("next", RenderedImage(b"next"))
     assert statuses.get_nowait() in (WorkerState.BUSY, WorkerState.READY)
 
@@ -557,8 +557,8 @@ def test_an_outcome_is_told_without_a_lock(tmp_path: Path) -> None:
 
 def compiling(it: Bench) -> tuple[int, int] | None:
     """How many kernels are there, of how many; None if none are being compiled."""
-    told = it.worker.status().compiling
-    return None if told is None else (told.done, told.total)
+    reported = it.worker.status().compiling
+    return None if reported is None else (reported.done, reported.total)
 
 
 @pytest.mark.fault(
@@ -636,7 +636,7 @@ def test_kernels_that_no_check_needs_are_compiled_when_nothing_else_waits(tmp_pa
 # --- the start --------------------------------------------------------------------------------------------------------
 
 
-def test_a_configuration_that_cannot_work_is_told(tmp_path: Path) -> None:
+def test_a_configuration_that_cannot_work_is_reported(tmp_path: Path) -> None:
     with running("unusable", tmp_path) as it:
         wait_until(lambda: it.worker.unusable is not None, "the refusal")
         assert it.worker.unusable == Reason("bad_model", "no such network")

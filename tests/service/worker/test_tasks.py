@@ -56,9 +56,9 @@ def test_no_calibration_waits_for_a_kernel_after_the_warm_up() -> None:
     """In a process of its own: in this one, other tests have run them all."""
     done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    warm, told = done.stdout.split(maxsplit=1)
+    warm, reported = done.stdout.split(maxsplit=1)
     assert int(warm) > 15
-    left, needless = told.split("|")
+    left, needless = reported.split("|")
     assert left.strip() == "[]"
     assert needless.strip() == "[]", "the second compiler compiles what no solve runs"
 

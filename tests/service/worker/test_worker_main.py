@@ -71,26 +71,26 @@ def test_an_answer_goes_under_the_number_of_its_question() -> None:
 
 
 def test_a_question_that_nobody_knows_is_refused() -> None:
-    told = tasks.answer_request(cast("Solver", Painter()), {"id": 7, "kind": "sing", "pair": "front"})
-    assert told["refused"]["code"] == "internal_error"
-    assert "'sing'" in told["refused"]["text"]
+    reported = tasks.answer_request(cast("Solver", Painter()), {"id": 7, "kind": "sing", "pair": "front"})
+    assert reported["refused"]["code"] == "internal_error"
+    assert "'sing'" in reported["refused"]["text"]
 
 
 @pytest.mark.fault("a fault of our own in the worker", "it is an answer, and the worker goes on")
 @pytest.mark.parametrize("message", [CHECK, OVERLAY, COMPARISON])
 def test_a_fault_of_the_program_is_an_answer(message: dict[str, Any]) -> None:
-    told = answer(ZeroDivisionError("division by zero"), message)
-    assert told.keys() == {"id", "refused"}
-    assert told["id"] == message["id"]
-    assert told["refused"]["code"] == "internal_error"
-    assert "ZeroDivisionError: division by zero" in told["refused"]["text"]
+    reported = answer(ZeroDivisionError("division by zero"), message)
+    assert reported.keys() == {"id", "refused"}
+    assert reported["id"] == message["id"]
+    assert reported["refused"]["code"] == "internal_error"
+    assert "ZeroDivisionError: division by zero" in reported["refused"]["text"]
 
 
 @pytest.mark.parametrize("message", [CHECK, OVERLAY, COMPARISON, SOLVE])
-def test_what_is_wrong_with_the_data_is_told_under_its_own_code(message: dict[str, Any]) -> None:
-    told = answer(CalibrationError("no pairs"), message)
+def test_what_is_wrong_with_the_data_is_reported_under_its_own_code(message: dict[str, Any]) -> None:
+    reported = answer(CalibrationError("no pairs"), message)
     refused = {"code": CalibrationError.reply_code, "text": "no pairs"}
-    assert told == {"id": message["id"], "refused": refused}
+    assert reported == {"id": message["id"], "refused": refused}
 
 
 def test_a_window_that_the_program_fails_on_ends_the_process() -> None:

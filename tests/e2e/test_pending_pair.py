@@ -73,7 +73,7 @@ def driver(router: Router) -> Iterator[zenoh.Session]:
         yield session
 
 
-def said(drive: Drive, off: np.ndarray[Any, Any] = OFF) -> bytes:
+def reported(drive: Drive, off: np.ndarray[Any, Any] = OFF) -> bytes:
     """`/tf_static` of the vehicle: the LiDAR on the base, and the camera on the base, which is not where it was."""
     rig = drive.recording.rig
     T_camera_lidar = se3.perturb(rig.T_camera_lidar_nominal, off)
@@ -83,7 +83,7 @@ def said(drive: Drive, off: np.ndarray[Any, Any] = OFF) -> bytes:
 
 def refused(running: Service, key: str) -> tuple[str, str]:
     with pytest.raises(RemoteError) as error:
-        running.ask(key)
+        running.query(key)
     return error.value.reply_code, str(error.value)
 
 
@@ -95,11 +95,11 @@ def test_eight_lines_are_enough(tmp_path: Path, drive: Drive, router: Router, dr
     config = configured(tmp_path, router.endpoint, SETTINGS)
     assert len(config.read_text().splitlines()) - len(SETTINGS.splitlines()) <= 8
     vehicle = Vehicle(driver)
-    vehicle.latch(TF, said(drive))  # before the service is there
+    vehicle.latch(TF, reported(drive))  # before the service is there
 
     with service(config, router) as running:
         keys = running.keys
-        health = running.until(running.health, lambda told: "no_image" in codes(told), "what is missing")
+        health = running.until(running.health, lambda report: "no_image" in codes(report), "what is missing")
         assert (health["state"], health["level"]) == ("unknown", 3)
         assert f"No CameraInfo on {INFO} yet." in health["needs"]
         code, text = refused(running, keys.extrinsic("front"))
@@ -118,13 +118,13 @@ def test_eight_lines_are_enough(tmp_path: Path, drive: Drive, router: Router, dr
         np.testing.assert_allclose(nominal["camera_from_lidar"]["matrix"], expected, atol=1e-9)
         assert (nominal["provenance"], nominal["status"]) == ("nominal", "not_accepted")
         assert (nominal["camera_frame"], nominal["lidar_frame"]) == (rig.camera_frame, rig.lidar_frame)
-        found = running.counters()["found"]
-        assert set(found) == {
+        detected = running.counters()["found"]
+        assert set(detected) == {
             "camera.intrinsics", "camera.frame_id", "lidar.frame_id", "T_camera_lidar", "ego.T_lidar_ego",
         }  # fmt: skip
-        assert "CameraInfo on" in found["camera.intrinsics"]
-        document = running.ask(keys.config)
-        assert document["found"]["front"] == found
+        assert "CameraInfo on" in detected["camera.intrinsics"]
+        document = running.query(keys.config)
+        assert document["found"]["front"] == detected
         assert document["config"]["pairs"][0]["camera"]["intrinsics"]["fx"] == rig.camera.fx
         T_lidar_ego = document["config"]["pairs"][0]["ego"]["T_lidar_ego"]
         np.testing.assert_allclose(T_lidar_ego, se3.inverse(T_BASE_LIDAR), atol=1e-9)
@@ -134,7 +134,7 @@ def test_eight_lines_are_enough(tmp_path: Path, drive: Drive, router: Router, dr
         running.until(running.counters, lambda pair: pair["windows"] > 0 or pair["selected"] >= PAIRS - 1, "the pairs")
         acknowledged = running.command("calibrate")
         assert acknowledged["accepted"], acknowledged
-        running.until(running.extrinsic, lambda told: told["status"] != "not_accepted", "the result")
+        running.until(running.extrinsic, lambda report: report["status"] != "not_accepted", "the result")
         result = running.extrinsic()
         assert result["status"] == "accepted"
         assert drive.error_deg(result, 0) < MAX_ERROR_DEG
@@ -150,14 +150,16 @@ def test_eight_lines_are_enough(tmp_path: Path, drive: Drive, router: Router, dr
         assert "nominal_changed" not in codes(running.health())
 
         later = Vehicle(driver)
-        later.latch(TF, said(drive, 2.0 * OFF))
-        told = running.until(running.health, lambda told: "nominal_changed" in codes(told), "a change that is told")
-        assert "T_camera_lidar" in reason(told, "nominal_changed")
+        later.latch(TF, reported(drive, 2.0 * OFF))
+        report = running.until(
+            running.health, lambda report: "nominal_changed" in codes(report), "a change that is told"
+        )
+        assert "T_camera_lidar" in reason(report, "nominal_changed")
         assert running.extrinsic()["camera_from_lidar"] == again["camera_from_lidar"], "never a silent change"
         assert running.command("reset")["code"] == "reset"
         np.testing.assert_allclose(running.extrinsic()["camera_from_lidar"]["matrix"], expected, atol=1e-9)
-        later.latch(TF, said(drive))
-        running.until(running.health, lambda told: "nominal_changed" not in codes(told), "the change is taken back")
+        later.latch(TF, reported(drive))
+        running.until(running.health, lambda report: "nominal_changed" not in codes(report), "the change is taken back")
         assert running.terminate() == 0
         later.close()
 
@@ -182,7 +184,7 @@ def test_rubbish_and_a_flood_keep_a_pair_waiting_and_no_other(
     config.write_text(config.read_text().replace("rmw_zenoh", "ros2dds"))
     with service(config, router, warm=False) as running:
         keys = running.keys
-        rear = running.ask(keys.extrinsic("rear"))
+        rear = running.query(keys.extrinsic("rear"))
         assert (rear["provenance"], rear["camera_frame"]) == ("nominal", "rear")
         flood = 2000
         for number in range(flood):
@@ -191,11 +193,11 @@ def test_rubbish_and_a_flood_keep_a_pair_waiting_and_no_other(
             if number % 10 == 0:
                 for topic in (TF, INFO, CAMERA, POINTS, EGO):
                     driver.put(topic[1:], bytes(number), congestion_control=BLOCK)
-        front = partial(running.ask, keys.health("front"))
-        health = running.until(front, lambda told: "camera_info_refused" in codes(told), "what is refused")
+        front = partial(running.query, keys.health("front"))
+        health = running.until(front, lambda report: "camera_info_refused" in codes(report), "what is refused")
         assert (health["state"], health["level"]) == ("unknown", 3)
         assert refused(running, keys.extrinsic("front"))[0] == "awaiting"
-        assert running.ask(keys.extrinsic("rear")) == rear
+        assert running.query(keys.extrinsic("rear")) == rear
         assert b'pair="front"' in query_one(running.session, keys.metrics, PATIENCE_S).payload
 
         for name in ("camera", "lidar", "ego"):
@@ -204,16 +206,16 @@ def test_rubbish_and_a_flood_keep_a_pair_waiting_and_no_other(
             topic, payload = message_of(frame)
             driver.put(topic[1:], payload, congestion_control=BLOCK)
         driver.put(INFO[1:], camera_info(rig.camera, rig.camera_frame), congestion_control=BLOCK)
-        latched(driver, TF[1:]).put(said(drive))
-        status = running.until(running.status, lambda told: awaits(told, "front") == [], "the pair is complete")
+        latched(driver, TF[1:]).put(reported(drive))
+        status = running.until(running.status, lambda report: awaits(report, "front") == [], "the pair is complete")
         losses = next(pair for pair in status["pairs"] if pair["name"] == "front")["losses"]
         record_property("figure", f"{sum(losses.values())} of {flood + flood // 2} messages counted as lost")
         assert losses["tf_static_message_malformed"] > 0
         expected = se3.perturb(rig.T_camera_lidar_nominal, OFF)
         np.testing.assert_allclose(
-            running.ask(keys.extrinsic("front"))["camera_from_lidar"]["matrix"], expected, atol=1e-9
+            running.query(keys.extrinsic("front"))["camera_from_lidar"]["matrix"], expected, atol=1e-9
         )
-        assert running.ask(keys.extrinsic("rear")) == rear
+        assert running.query(keys.extrinsic("rear")) == rear
         assert running.terminate() == 0
 
 

@@ -39,20 +39,20 @@ def frames() -> EdgeFrames:
     )
 
 
-def score(frames: EdgeFrames, pose: NDArray[np.float64], climb: AscentStart) -> float:
+def score(frames: EdgeFrames, pose: NDArray[np.float64], ascent: AscentStart) -> float:
     at = frame_alignment(frames, pose)
     of_frames = at.strength / np.sqrt(at.square)
-    return float(np.cumsum(of_frames[climb.first : climb.last])[-1])
+    return float(np.cumsum(of_frames[ascent.first : ascent.last])[-1])
 
 
-def plain(frames: EdgeFrames, climb: AscentStart) -> tuple[NDArray[np.float64], float]:
-    pose, best, fineness = climb.pose, score(frames, climb.pose, climb), 0
+def plain(frames: EdgeFrames, ascent: AscentStart) -> tuple[NDArray[np.float64], float]:
+    pose, best, fineness = ascent.pose, score(frames, ascent.pose, ascent), 0
     for _ in range(MAX_SWEEPS):
         improved = False
         for move in MOVES[fineness]:
             # As `se3.perturb` adds it up: entry by entry.
             trial = np.array([[sum(move[i, k] * pose[k, j] for k in range(4)) for j in range(4)] for i in range(4)])
-            if (reached := score(frames, trial, climb)) > best:
+            if (reached := score(frames, trial, ascent)) > best:
                 pose, best, improved = trial, reached, True
         fineness += not improved
         if fineness == len(MOVES):
@@ -60,22 +60,22 @@ def plain(frames: EdgeFrames, climb: AscentStart) -> tuple[NDArray[np.float64], 
     return pose, best
 
 
-def test_climbs_at_once_end_where_each_ends_by_itself(frames: EdgeFrames) -> None:
-    begun = [
+def test_ascents_at_once_end_where_each_ends_by_itself(frames: EdgeFrames) -> None:
+    started = [
         AscentStart(se3.perturb(TRUTH, 0.01 * np.array([1.0, -1.0, 0.5, 0.0, 0.0, 0.0])), 0, 5),
         AscentStart(TRUTH, 3, 5),
         AscentStart(se3.perturb(TRUTH, np.array([0.0, 0.015, 0.0, 0.0, 0.0, 0.0])), 0, 1),
     ]
-    kept = [climb.pose.copy() for climb in begun]
-    for end, climb, before in zip(ascend(frames, begun, MOVES), begun, kept, strict=True):
-        pose, best = plain(frames, climb)
+    retained = [ascent.pose.copy() for ascent in started]
+    for end, ascent, before in zip(ascend(frames, started, MOVES), started, retained, strict=True):
+        pose, best = plain(frames, ascent)
         np.testing.assert_allclose(end.pose, pose, rtol=0.0, atol=1e-15)
         assert end.score == pytest.approx(best, rel=1e-12)
-        assert end.score > score(frames, before, climb)
-        np.testing.assert_array_equal(climb.pose, before)
+        assert end.score > score(frames, before, ascent)
+        np.testing.assert_array_equal(ascent.pose, before)
 
 
-def test_a_climb_of_no_frames_ends_where_it_began(frames: EdgeFrames) -> None:
+def test_a_ascent_of_no_frames_ends_where_it_began(frames: EdgeFrames) -> None:
     (end,) = ascend(frames, [AscentStart(TRUTH, 2, 2)], MOVES)
     np.testing.assert_array_equal(end.pose, TRUTH)
     assert end.score == 0.0
