@@ -112,7 +112,8 @@ def test_output_folder_holds_table_report_and_pictures(
     monkeypatch.setattr(solve_experiments, "SUBSETS", 2)
     outcome = coec(
         "evaluate", SMALL, "--depth", "stereo", "--rotation-deg", "2", "--translation-m", "0.1", "--directions", "3",
-        "--dof", "3", "--frames", "2", "--against-frames", "--against-slice", "--output", tmp_path / "out", "--json",
+        "--dof", "3", "--objective", "mi", "--frames", "2", "--against-frames", "--against-slice",
+        "--output", tmp_path / "out", "--json",
     )  # fmt: skip
     written = tmp_path / "out"
     assert json.loads((written / "report.json").read_text()) == outcome.document
