@@ -20,7 +20,7 @@ from coec.geometry.cameras import build
 from coec.geometry.cameras.double_sphere import DoubleSphere
 from coec.geometry.mutual_information import BinnedFrames, mutual_information
 from coec.geometry.projection import BUNDLE, moved
-from coec_lab.bench.reference_kernels import by_numpy, by_scalar_loop
+from coec_lab.bench.kernels import by_numpy, by_scalar_loop
 
 POINTS, BINS, SIZE = 114_000, 32, 512
 

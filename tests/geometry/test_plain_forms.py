@@ -8,7 +8,7 @@ import pytest
 from coec.geometry.cameras import build
 from coec.geometry.mutual_information import BinnedFrames
 from coec.geometry.projection import project
-from coec_lab.bench.reference_kernels import by_numpy, by_scalar_loop
+from coec_lab.bench.kernels import by_numpy, by_scalar_loop
 from support.oracles import mutual_information_of_frame
 
 WIDTH, HEIGHT, BINS, POINTS = 90, 70, 8, 4000
