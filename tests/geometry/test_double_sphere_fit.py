@@ -165,5 +165,5 @@ def test_the_fit_is_deterministic() -> None:
 
 def test_a_camera_that_sees_none_of_its_pixels_is_refused() -> None:
     blind = cameras.build("eucm", **SMALL | {"cx": 1e6}, alpha=1.0, beta=1.0)
-    with pytest.raises(ValueError, match="sees only 0 of its pixels"):
+    with pytest.raises(ValueError, match="only 0 pixels of the camera have a ray"):
         fit_double_sphere(blind)
