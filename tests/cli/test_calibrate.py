@@ -202,7 +202,7 @@ def test_malformed_perturbation(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("count", "expected", "chosen"),
+    ("count", "expected", "selected"),
     [(3, 25, [0, 1, 2]), (10, 1, [0]), (10, 2, [0, 9]), (101, 5, [0, 25, 50, 75, 100]), (4, 3, [0, 2, 3])],
 )
 def test_evenly_spreads_over_the_recording(count: int, expected: int, selected: list[int]) -> None:

@@ -87,6 +87,7 @@ WIRE = {
     "service/coec_lab/experiments/evaluation_schema.py": {"told_s", "wanted", "wanted_s"},
     "service/coec_lab/experiments/mount_steps.py": {"told_s"},
     "service/coec_lab/experiments/simulation_schemas.py": {"KnockedRow", "RigLook", "biased_found", "knocked", "looks"},
+    "tests/upgrade/test_step_back.py": {"independent_looks"},
 }
 """Fields of messages, of files on a vehicle's disk and of published tables, and the models that are named in their JSON
 Schemas: the contract holds them."""

@@ -47,10 +47,10 @@ def test_a_process_that_dies_is_reported_with_what_to_do() -> None:
 KILLED = """
 import sys
 from pathlib import Path
-from lab.made_drives import begun
+from lab.made_drives import started
 from coec_lab.commands.drive_pool import finished
 if __name__ == "__main__":
-    list(finished(begun, [Path(sys.argv[1])] * 2, 2))
+    list(finished(started, [Path(sys.argv[1])] * 2, 2))
 """
 
 

@@ -333,7 +333,7 @@ def written(folder: Path, documents: dict[str, object]) -> None:
     StateFile(folder / STATE_FILE).save({"pairs": documents})
 
 
-def test_two_pairs_that_lose_parts_set_one_file_offset(tmp_path: Path) -> None:
+def test_two_pairs_that_lose_parts_quarantine_one_file(tmp_path: Path) -> None:
     front, rear = SEEDS["held and healthy"].document, SEEDS["miscalibrated"].document
     front["versions"]["monitor"], rear["track"] = 99, "x"
     written(tmp_path, {"front": front, "rear": rear})

@@ -74,7 +74,7 @@ class OldResult(Old):
     systematic: dict[str, Six]
     correlation_pitch_height: float | None
     correlation_yaw_side: float | None
-    independent_observations: float | None
+    independent_looks: float | None
     solved: Flags6
     unobservable: Flags6
     status: Literal["not_accepted", "accepted", "failed"]
