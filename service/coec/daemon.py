@@ -1,8 +1,6 @@
 """The daemon: runs the service in this process until it is told to stop. Builds the objects, starts the threads,
 watches them, and ends them in order. If any thread dies, `health` says why and the process ends, so that the
 service never goes on with a part missing.
-
-If any thread dies, `health` says why and the process ends, so that the service never goes on with a part missing.
 """
 
 import logging

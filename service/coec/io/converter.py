@@ -135,9 +135,10 @@ def bounded(read: Callable[[Any], T], accepts: Callable[[T], bool], expected: st
     """A field whose values are a part of a type; `expected` says which."""
 
     def read_bounded(value: Any, _: object) -> T:
-        if not accepts(read(value)):
+        result = read(value)
+        if not accepts(result):
             raise MalformedValueError(f"expected {expected}")
-        return read(value)
+        return result
 
     return override(struct_hook=read_bounded)
 

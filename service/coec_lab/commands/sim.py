@@ -38,12 +38,11 @@ def rig_drives(
     window, as on the vehicle. Only the image rows that the LiDAR sees are rendered. Finished drives are retained in
     DIR: run the command again, with more drives, to continue. A DIR holds results of one state of the code.
     """
-    from coec.io import user_files as files
+    from coec.io import user_files
     from coec.reports import console
     from coec.schemas.message import to_json
     from coec_lab.commands.drive_pool import drive_file, finished, resumed
-    from coec_lab.experiments import rig_drive_statistics, rig_drives
-    from coec_lab.experiments import rig_moves as rig_tables
+    from coec_lab.experiments import rig_drive_statistics, rig_drives, rig_moves
     from coec_lab.experiments.rig_drives import DisplacedRigDrive
     from coec_lab.experiments.simulation_schemas import RigDriveRow
     from coec_lab.simulation.source import require_extra
@@ -56,15 +55,15 @@ def rig_drives(
         task = bars.add_task("drives", total=len(names), completed=len(rows), note="")
         pending = [drive for drive in planned if drive.name not in rows]
         for row in finished(rig_drives.driven, pending, jobs):
-            files.replace_output(drive_file(output, row.name), to_json(row))
+            user_files.replace_output(drive_file(output, row.name), to_json(row))
             rows[row.name] = row
             bars.update(task, advance=1, note=row.name)
     report = rig_drive_statistics.report([rows[name] for name in names], camera)
-    files.write_output(output / "report.json", to_json(report))
+    user_files.write_output(output / "report.json", to_json(report))
     if as_json:
         console.print_json(report.model_dump(mode="json"))
     else:
-        rig_tables.show_drives(report)
+        rig_moves.show_drives(report)
     return 0
 
 
@@ -80,7 +79,6 @@ def rig_moves(
     """
     from coec.reports import console
     from coec_lab.experiments import rig_moves
-    from coec_lab.experiments import rig_moves as rig_tables
 
     with console.progress() as bars:
         task = bars.add_task("drives", total=len(rig_moves.FAULTS) * drives, note="")
@@ -88,7 +86,7 @@ def rig_moves(
     if as_json:
         console.print_json(report.model_dump(mode="json"))
     else:
-        rig_tables.show(report)
+        rig_moves.show(report)
     return 0
 
 
@@ -131,12 +129,11 @@ def matrix(
     A drive takes about half a minute of one core, the whole matrix most of an hour. Finished drives are retained in
     DIR: run the command again to continue. A DIR holds results of one state of the code; use another after a change.
     """
-    from coec.io import user_files as files
+    from coec.io import user_files
     from coec.reports import console
     from coec.schemas.message import to_json
     from coec_lab.commands.drive_pool import drive_file, finished, resumed
-    from coec_lab.experiments import matrix_drives as matrix_run
-    from coec_lab.experiments import matrix_statistics, plots
+    from coec_lab.experiments import matrix_drives, matrix_statistics, plots
     from coec_lab.experiments.simulation_schemas import MatrixRow
     from coec_lab.simulation.source import require_extra
 
@@ -147,13 +144,13 @@ def matrix(
     with console.progress() as bars:
         task = bars.add_task("drives", total=len(drives), completed=len(rows), note="")
         pending = [drive for drive in drives if drive.name not in rows]
-        for row in finished(partial(matrix_run.run, settings=settings), pending, jobs):
-            files.write_output(drive_file(output, row.name), to_json(row))
+        for row in finished(partial(matrix_drives.run, settings=settings), pending, jobs):
+            user_files.write_output(drive_file(output, row.name), to_json(row))
             rows[row.name] = row
             bars.update(task, advance=1, note=row.name)
     report = matrix_statistics.report([rows[name] for name in names])
-    files.write_output(output / "report.json", to_json(report))
-    files.write_output(output / "normalised.png", plots.matrix_errors(report))
+    user_files.write_output(output / "report.json", to_json(report))
+    user_files.write_output(output / "normalised.png", plots.matrix_errors(report))
     if as_json:
         console.print_json(report.model_dump(mode="json"))
     else:
@@ -216,13 +213,11 @@ def checks(
     places. Finished drives are retained in DIR: run the command again, with more rounds, to continue. A DIR holds
     results of one state of the code.
     """
-    from coec.io import user_files as files
+    from coec.io import user_files
     from coec.reports import console
     from coec.schemas.message import to_json
     from coec_lab.commands.drive_pool import drive_file, finished, resumed
     from coec_lab.experiments import check_drives, check_statistics
-    from coec_lab.experiments import check_drives as check_run
-    from coec_lab.experiments import check_statistics as check_tables
     from coec_lab.experiments.simulation_schemas import CheckedDrive
     from coec_lab.simulation.source import require_extra
 
@@ -235,17 +230,17 @@ def checks(
     with console.progress() as bars:
         task = bars.add_task("drives", total=len(names), completed=len(rows), note="commissioning")
         baselines = _baselines({drive.rig for outing in pending for drive in outing}, jobs)
-        for outing in finished(partial(check_run.run, baselines=baselines), pending, jobs):
+        for outing in finished(partial(check_drives.run, baselines=baselines), pending, jobs):
             for row in outing:
-                files.write_output(drive_file(output, row.name), to_json(row))
+                user_files.write_output(drive_file(output, row.name), to_json(row))
                 rows[row.name] = row
                 bars.update(task, advance=1, note=row.name)
     report = check_statistics.report([rows[name] for name in names], hours)
-    files.write_output(output / "report.json", to_json(report))
+    user_files.write_output(output / "report.json", to_json(report))
     if as_json:
         console.print_json(report.model_dump(mode="json"))
     else:
-        check_tables.show(report)
+        check_statistics.show(report)
     return 0
 
 
@@ -266,10 +261,10 @@ def _baselines(rigs: Collection[str], jobs: int | None) -> dict[str, Baseline]:
 
 def _commissioned(rig: str) -> tuple[str, Baseline | CalibrationError]:
     from coec.errors import CalibrationError
-    from coec_lab.experiments import check_drives as check_run
+    from coec_lab.experiments import check_drives
 
     try:
-        return rig, check_run.commissioned(rig)
+        return rig, check_drives.commissioned(rig)
     except CalibrationError as error:
         return rig, error
 

@@ -108,9 +108,8 @@ class _PairDocuments:
             query_of, before = self._answers.get(key, (None, None))
             # A change that was received meanwhile is as new as this answer, or newer. Of several answers to one query
             # the latest counts.
-            if (key not in self._known or (query_of is query_id and is_later(stamp, before))) and self._deliver(
-                reply.ok
-            ):
+            is_newest = key not in self._known or (query_of is query_id and is_later(stamp, before))
+            if is_newest and self._deliver(reply.ok):
                 self._answers[key] = (query_id, stamp)
 
     def _deliver(self, sample: zenoh.Sample) -> bool:
