@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
+from typing import Any, get_args
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ from hypothesis import given
 from numba import njit
 from numpy.typing import NDArray
 
+from coec.config import CameraIntrinsics
 from coec.geometry import cameras
 from coec.geometry.cameras import Camera, in_image, project_point, unproject_point
 from coec.geometry.cameras.base import polar_angle
@@ -455,6 +457,15 @@ def test_single_precision_points_are_projected_in_double(camera: Camera) -> None
 
 
 # ----------------------------------------------------------------------------------------- building and scaling
+
+
+def test_a_file_with_a_formula_is_a_model_in_the_configuration_and_in_these_tests() -> None:
+    folder = Path(cameras.__file__).parent
+    models = {path.stem for path in folder.glob("*.py") if "\ndef image_point(camera: " in path.read_text("utf-8")}
+    models.discard("registry")
+    assert set(cameras.MODELS) == models
+    assert get_args(CameraIntrinsics.model_fields["model"].annotation) == tuple(cameras.MODELS)
+    assert list(CAMERAS) == list(cameras.MODELS)
 
 
 @every_variant

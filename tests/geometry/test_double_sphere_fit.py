@@ -18,7 +18,7 @@ def test_a_pinhole_is_met_exactly() -> None:
     )
     fit = fit_double_sphere(pinhole)
     assert (fit.camera.xi, fit.camera.alpha) == (0.0, 0.0)
-    assert fit.camera[:6] == pytest.approx(pinhole[:6], rel=1e-12)
+    assert fit.camera[:6] == pytest.approx(tuple(pinhole), rel=1e-12)
     assert fit.residual_max_px < 1e-9
     assert fit.coverage == 1.0
 

@@ -3,12 +3,18 @@ of its calibration.
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias, get_args
 
 from pydantic import Field, field_validator, model_validator
 
 from coec.config import stages
 from coec.config.model import IDENTITY, ConfigModel, FilePath, KeyExpression, Matrix4x4, Name
+from coec.geometry import CAMERA_MODELS
+
+if TYPE_CHECKING:
+    CameraModel: TypeAlias = str
+else:
+    CameraModel = Literal[CAMERA_MODELS]
 
 ROS_NAMES = {
     "plumb_bob": "radtan",
@@ -25,9 +31,7 @@ class CameraIntrinsics(ConfigModel):
     """Intrinsics of a camera; `model` determines which of the optional parameters are needed. The names are those of
     `dataset.yaml`."""
 
-    model: Literal["pinhole", "radtan", "rational", "kannala_brandt", "mei", "eucm", "double_sphere"] = Field(
-        description="model of the lens"
-    )
+    model: CameraModel = Field(description="model of the lens")
     width: int = Field(gt=0, le=16384, description="image width, px")
     height: int = Field(gt=0, le=16384, description="image height, px")
     fx: float = Field(gt=0, description="focal length, px")

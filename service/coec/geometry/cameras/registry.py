@@ -5,27 +5,29 @@ angle that a pixel covers.
 
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
+from importlib import import_module
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, Self, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.geometry.cameras import double_sphere, eucm, kannala_brandt, mei, pinhole, radtan, rational
-from coec.geometry.cameras.base import guarded_pixel, positive
+from coec.geometry import CAMERA_MODELS
+from coec.geometry.cameras.base import CameraFields, guarded_pixel, positive
 from coec.geometry.points import rows_of
 
-Camera = (
-    pinhole.Pinhole
-    | radtan.RadTan
-    | rational.Rational
-    | kannala_brandt.KannalaBrandt
-    | mei.Mei
-    | eucm.Eucm
-    | double_sphere.DoubleSphere
-)
+
+class Camera(CameraFields, Protocol):
+    """A camera of any model: the named tuple that the `build` of its module returns."""
+
+    def __iter__(self) -> Iterator[float]: ...
+    def __hash__(self) -> int: ...
+    def _asdict(self) -> dict[str, Any]: ...
+    def _replace(
+        self, *, width: int = ..., height: int = ..., fx: float = ..., fy: float = ..., cx: float = ..., cy: float = ...
+    ) -> Self: ...
 
 
 class Model(NamedTuple):
@@ -43,22 +45,20 @@ class Model(NamedTuple):
         return tuple(inspect.signature(self.build).parameters)
 
 
+_MODULES = {name: import_module(f"coec.geometry.cameras.{name}") for name in CAMERA_MODELS}
+
 MODELS: Mapping[str, Model] = MappingProxyType(
     {
-        name: Model(name, camera_type, module.build, module.image_point, module.unproject_point)
-        for name, camera_type, module in (
-            ("pinhole", pinhole.Pinhole, pinhole),
-            ("radtan", radtan.RadTan, radtan),
-            ("rational", rational.Rational, rational),
-            ("kannala_brandt", kannala_brandt.KannalaBrandt, kannala_brandt),
-            ("mei", mei.Mei, mei),
-            ("eucm", eucm.Eucm, eucm),
-            ("double_sphere", double_sphere.DoubleSphere, double_sphere),
+        name: Model(
+            name, get_type_hints(module.build)["return"], module.build, module.image_point, module.unproject_point
         )
+        for name, module in _MODULES.items()
     }
 )
 
-HELPERS: tuple[Callable[..., Any], ...] = rational.HELPERS
+HELPERS: tuple[Callable[..., Any], ...] = tuple(
+    helper for module in _MODULES.values() for helper in getattr(module, "HELPERS", ())
+)
 """Functions of lenses that their formulas call: compiled with them."""
 
 _BY_TYPE: Mapping[type, Model] = MappingProxyType({model.camera_type: model for model in MODELS.values()})
@@ -166,7 +166,7 @@ def in_image(camera: Camera, uv_px: NDArray[np.floating]) -> NDArray[np.bool_]:
 @lru_cache(maxsize=64, typed=True)
 def in_single_precision(camera: Camera) -> Camera:
     """The same camera with intrinsics as float32: in single precision a vector register holds twice as many points."""
-    return type(camera)(*(field if isinstance(field, int) else np.float32(field) for field in camera))  # type: ignore[arg-type]
+    return type(camera)(*(field if isinstance(field, int) else np.float32(field) for field in camera))
 
 
 def domain_angle_rad(camera: Camera) -> float:
