@@ -153,7 +153,7 @@ def test_a_pair_that_cannot_be_built_is_pending_again(stack: ExitStack, tmp_path
 
 def test_the_end_of_the_service_is_reported_for_those_who_wait(stack: ExitStack, tmp_path: Path) -> None:
     room, _, world = opened(stack, configured(tmp_path), tmp_path)
-    room.fail(Reason("thread_died", "The thread look-out died."))
+    room.fail(Reason("thread_died", "The thread discovery died."))
     assert b"thread_died" in world.published[-1][1].payload
 
 

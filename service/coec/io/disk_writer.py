@@ -1,10 +1,10 @@
-"""The scribe: a thread that writes to the disk what other threads have noted in memory, so that only it has to wait.
+"""A thread that writes to the disk what other threads have noted in memory, so that only it has to wait.
 
-A thread that has noted something tells the scribe and goes on. If the disk is full, read-only or slow, only the scribe
+A thread that has noted something notifies this one and goes on. If the disk is full, read-only or slow, only this one
 waits. It tries again every second, together with whatever was noted meanwhile. A thread that has to know can ask
 whether everything is on the disk; it waits no longer than a healthy disk needs.
 
-Somebody may remove the folder and make it again while the service runs. Then all books are written again, from what
+Somebody may remove the folder and make it again while the service runs. Then all files are written again, from what
 each has in memory: nothing counts as being on the disk because it was written into a folder that is gone.
 """
 
@@ -52,10 +52,10 @@ class Persistable(Protocol):
 
 
 class DiskWriter:
-    """Writes all books in one folder. `thread` writes; the methods are for any thread unless they say otherwise."""
+    """Writes all files of one folder. `thread` writes; the methods are for any thread unless they say otherwise."""
 
     def __init__(self, folder: Path) -> None:
-        self.thread = ServiceThread("scribe", self._run)
+        self.thread = ServiceThread("disk-writer", self._run)
         self._folder = folder
         self._condition = threading.Condition()
         self._due: dict[Persistable, None] = {}
@@ -68,7 +68,7 @@ class DiskWriter:
         self._space: Reason | None = None
 
     def write(self, *items: Persistable) -> None:
-        """Have these books written soon, in this order, because something was noted in them."""
+        """Have these files written soon, in this order, because something was noted in them."""
         with self._condition:
             self._due.update(dict.fromkeys(items))
             self._registered.update(dict.fromkeys(items))
@@ -76,7 +76,7 @@ class DiskWriter:
             self._condition.notify_all()
 
     def register(self, *items: Persistable) -> None:
-        """Have these books written, in this order and after all earlier ones, whenever the folder was removed and made
+        """Have these files written, in this order and after all earlier ones, whenever the folder was removed and made
         again. Those that were ever written are kept anyway."""
         with self._condition:
             for item in items:
@@ -84,7 +84,7 @@ class DiskWriter:
                 self._registered[item] = None
 
     def on_replaced(self, report: Callable[[str], object]) -> None:
-        """Call `report` with one sentence on the scribe's thread, before the books are written into another folder."""
+        """Call `report` with one sentence on this thread, before the files are written into another folder."""
         self._report_replaced.append(report)
 
     def has_written(self) -> bool:
@@ -111,7 +111,7 @@ class DiskWriter:
         return failure or self._space
 
     def write_due(self) -> None:
-        """Write the books that are due. For the scribe's own thread, or for use without a thread."""
+        """Write the files that are due. For `thread`, or for use without a thread."""
         with self._condition:
             self._started_s = time.monotonic()
         self._notice_replacement()
@@ -124,7 +124,7 @@ class DiskWriter:
                 item.flush()
             except StateError as error:
                 failed[item] = error
-        self._notice_replacement()  # while the books were written: then they have to be written again
+        self._notice_replacement()  # while the files were written: then they have to be written again
         with self._condition:
             self._started_s = None
             self._due = {**dict.fromkeys(failed), **self._due}
@@ -136,11 +136,11 @@ class DiskWriter:
             self._condition.notify_all()
 
     def _notice_replacement(self) -> None:
-        """Make all books due if the folder is another one than before."""
+        """Make all files due if the folder is another one than before."""
         try:
             there = self._folder.stat()
         except OSError:
-            return  # the books cannot be written either, and say so
+            return  # the files cannot be written either, and say so
         if self._pin is not None and self._pin.holds(there):
             return
         before, self._pin = self._pin, _Pin.of(self._folder)
@@ -158,7 +158,7 @@ class DiskWriter:
             self._requested += 1
 
     def check_folder(self) -> None:
-        """See whether the disk has room, and whether the folder is still the same. For the scribe's own thread, because
+        """See whether the disk has room, and whether the folder is still the same. For `thread`, because
         on a disk that hangs even this waits."""
         self._notice_replacement()
         try:
@@ -189,7 +189,7 @@ class DiskWriter:
         self.write_due()
 
     def request_stop(self) -> None:
-        """Have the due books written once more, and end the thread."""
+        """Have the due files written once more, and end the thread."""
         self.thread.request_stop()
         with self._condition:
             self._condition.notify_all()

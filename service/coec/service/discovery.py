@@ -364,7 +364,7 @@ class StoredDiscovery(Part):
 
 
 class DiscoveryStore:
-    """The nominal calibrations of a vehicle, as a book that the scribe writes. Safe to use from several threads."""
+    """The nominal calibrations of a vehicle, which the disk writer stores. Safe to use from several threads."""
 
     def __init__(self, folder: Path) -> None:
         self._lock = threading.Lock()

@@ -97,7 +97,7 @@ class DiscoveryListener:
     def __init__(self, config: Config, earlier: Mapping[str, DiscoveredPair]) -> None:
         """`config` is the configuration as it was read. `earlier` holds those of its awaited pairs that are built with
         values from before the start."""
-        self.thread = ServiceThread("nominal", self._run)
+        self.thread = ServiceThread("discovery", self._run)
         self._config = config
         requested = {pair.name: pair for pair in config.awaited}
         self._pairs = {

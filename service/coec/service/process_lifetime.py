@@ -67,7 +67,7 @@ def locked(folder: Path) -> Iterator[FolderLock]:
 
 
 class FolderLock:
-    """The lock of a state directory. It is one of its books (`scribe.Book`): if somebody has removed the directory and
+    """The lock of a state directory. It is `Persistable` too: if somebody has removed the directory and
     made it again, the lock is taken again with the rest."""
 
     def __init__(self, folder: Path) -> None:

@@ -71,7 +71,7 @@ def test_health_is_published_when_its_reasons_change_and_not_otherwise(pending: 
     pending.answers.renew()
     pending.world.problems = (Reason("disk_full", "The disk is full."),)
     pending.answers.renew()
-    pending.answers.fail(Reason("thread_died", "The thread look-out died."))
+    pending.answers.fail(Reason("thread_died", "The thread discovery died."))
     assert len(pending.world.published) == 4
     assert codes(pending.health) == ["no_cloud", "disk_full", "thread_died"]
 

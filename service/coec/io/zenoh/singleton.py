@@ -135,7 +135,7 @@ class SingletonGuard:
             session: the daemon's.
             since_ns: wall clock at the start of the daemon, for the messages of other daemons.
         """
-        self.thread = ServiceThread("look-out", self._watch)
+        self.thread = ServiceThread("singleton-guard", self._watch)
         self.rival: Claim | None = None
         self.hidden = False
         self.unproven: tuple[str, ...] = ()

@@ -134,7 +134,7 @@ class SnippetStore:
             )
 
     def flush(self) -> None:
-        """Takes from the list what somebody has removed; for the scribe (`scribe.Book`)."""
+        """Takes from the list what somebody has removed; for the disk writer (`Persistable`)."""
         with self._lock:
             listed = tuple(self._infos)
         gone = [name for name in listed if not self.path(name).exists()]

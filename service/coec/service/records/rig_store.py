@@ -240,7 +240,7 @@ def _pose(rows: Rows) -> Matrix4:
 
 
 class RigBaseline:
-    """Belongs to the thread that decides about the pair; `flush` is for the scribe.
+    """Belongs to the thread that decides about the pair; `flush` is for the disk writer.
 
     Attributes:
         trouble: why an existing baseline is not used; else None.
