@@ -1,12 +1,9 @@
 """The rig form of a configuration lists each sensor of a vehicle once; the long form of `pairs` follows from it. Links
-are known rigid poses between two sensors of a kind. A pair of camera C and LiDAR L is named `C-L`, or just `C` if
-the vehicle has one LiDAR. Its nominal calibration is inverse(T_vehicle_camera) · T_vehicle_lidar if both poses are
-given; otherwise the pair is incomplete, as any pair without a nominal calibration. On native keys a sensor's
-`frame_id` is its name unless another is given.
+are known rigid poses between two sensors of a kind.
 
 A pair of camera C and LiDAR L is named `C-L`, or just `C` if the vehicle has one LiDAR. Its nominal calibration is
-inverse(T_vehicle_camera) · T_vehicle_lidar if both poses are given; otherwise it is awaited, as for any pair. On native
-keys a sensor's `frame_id` is its name unless another is given.
+inverse(T_vehicle_camera) · T_vehicle_lidar if both poses are given; otherwise the pair is incomplete, as any pair
+without a nominal calibration. On native keys a sensor's `frame_id` is its name unless another is given.
 """
 
 from __future__ import annotations

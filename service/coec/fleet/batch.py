@@ -1,7 +1,5 @@
 """Evaluates many windows again: jobs -> engine -> rows -> tables. The folder of a batch holds its settings, the
-finished rows, and the tables that are made of them. A finished row is on the disk before the next one is awaited.
-So a batch that is stopped at any point, or whose machine loses its power, loses only the windows under way. Rows
-wait in a journal until there are enough for a file of a table.
+finished rows, and the tables that are made of them.
 
 A finished row is on the disk before the next one is awaited. So a batch that is stopped at any point, or whose machine
 loses its power, loses only the windows under way. Rows wait in a journal until there are enough for a file of a table.

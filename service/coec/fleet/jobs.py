@@ -1,10 +1,9 @@
 """The windows of a batch: finds them from patterns, on this machine or behind URLs of a store that fsspec knows,
-fetches them, and makes the rows of those without a result. Credentials for stores travel as an argument of the
-processes that evaluate windows, over Ray's own connections. Ray's runtime environment is not used for them, because
-Ray writes it into a log file on every node (`runtime_env_agent.log`) as it is.
+fetches them, and makes the rows of those without a result.
 
-They travel as an argument of the processes that judge, over Ray's own connections. Ray's runtime environment is not
-used for them, because Ray writes it into a log file on every node (`runtime_env_agent.log`) as it is.
+Credentials for stores travel as an argument of the processes that evaluate windows, over Ray's own connections. Ray's
+runtime environment is not used for them, because Ray writes it into a log file on every node (`runtime_env_agent.log`)
+as it is.
 """
 
 from __future__ import annotations

@@ -1,10 +1,5 @@
 """Distributes windows over worker processes, wherever they run. `Engine` is the interface of what evaluates a batch;
-`WorkerPool` does the work of every engine. A process gets windows when it has started, never before: one that no
-machine has room for holds none back. A window counts as tried only if it was with a process that ran. What a
-process does to its windows, and what is done about it: | the process | its windows | |---|---| | ended, or exceeded
-a bound | each is tried once more, alone; the second end is a row with an error | | was lost with its machine | are
-evaluated by others; the third loss is a row with an error | | failed several times in succession for a common cause
-| are evaluated by others; this process gets no more |
+`WorkerPool` does the work of every engine.
 
 A process gets windows when it has started, never before: one that no machine has room for holds none back. A window
 counts as tried only if it was with a process that ran. What a process does to its windows, and what is done about it:
@@ -12,8 +7,8 @@ counts as tried only if it was with a process that ran. What a process does to i
 | the process | its windows |
 |---|---|
 | ended, or exceeded a bound | each is tried once more, alone; the second end is a row with an error |
-| was lost with its machine | are judged by others; the third loss is a row with an error |
-| failed several times in succession for a common cause | are judged by others; this process gets no more |
+| was lost with its machine | are evaluated by others; the third loss is a row with an error |
+| failed several times in succession for a common cause | are evaluated by others; this process gets no more |
 """
 
 import logging

@@ -1,8 +1,5 @@
-"""One self-contained HTML file from a `Page`: the blocks that a page is made of, pictures shrunk until all of them
-fit, and the templates that are filled. Names that came over a network can only ever be text, for two reasons:
-templates escape whatever they are given, and the content policy in the head of the page lets no script run but the
-page's own. Characters without a shape, and those that reverse the order of others, are shown as escapes
-(`coec.untrusted`). The content of each page is in a module of its own, such as `incident_page`.
+"""One self-contained HTML file from a `Page`: the blocks that a page is made of, pictures shrunk until all of them fit,
+and the templates that are filled. The content of each page is in a module of its own, such as `incident_page`.
 
 Names that came over a network can only ever be text, for two reasons: templates escape whatever they are given, and the
 content policy in the head of the page lets no script run but the page's own. Characters without a shape, and those that

@@ -1,6 +1,5 @@
 """Documents about many vehicles: a row for each window that was evaluated again, the summary of a batch, the report on
-a fleet, and the state of a fleet at this moment (`coec watch --once --json`). Angles in degrees, lengths in metres,
-axes rx ry rz tx ty tz about and along the camera axes.
+a fleet, and the state of a fleet at this moment (`coec watch --once --json`).
 
 Angles in degrees, lengths in metres, axes rx ry rz tx ty tz about and along the camera axes.
 """

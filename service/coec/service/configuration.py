@@ -1,10 +1,8 @@
 """The configuration of a running service: as it is served, without secrets, and which changes of it are taken over at
-once and which wait for the next start. A changed value is taken over only if everything that depends on it can go
-on without a break: limits, rules, the length of windows. Values with which streams, files, networks or sessions
-were opened stay until those are opened again.
+once and which wait for the next start.
 
 A changed value is taken over only if everything that depends on it can go on without a break: limits, rules, the length
-of windows. Values with which streams, files, networks or sessions were opened stay until those are opened anew.
+of windows. Values with which streams, files, networks or sessions were opened stay until those are opened again.
 """
 
 import fnmatch

@@ -1,29 +1,19 @@
 """The processor budget of a service: which pair's check may begin, what checks and windows cost, and what was used.
-Streams acquire checks, the worker's supervisor books their cost, status reports. A check may begin when the token
-bucket holds enough for it and for all waiting checks with a stronger claim. A suspected pair comes first and may
-borrow. Then comes the pair whose last check is longest ago, counted in its own periods. If the budget suffices for
-all, nobody waits, and every check is made at the pair of frames at which it was requested. If it does not, only
-some of these checks are made, and all periods are stretched by the same factor. The bucket holds seconds of
-processor time. As time passes, it is filled by the budget less the instalments for windows. Windows are paid in
-instalments because a solve takes seconds: if it were paid at once, no pair would be checked until that time is
-earned. Checks are paid when they are done. The scheduler is a state machine without threads or clocks; only sensor
-time passes in it. `Budget` is one lock around it, held for microseconds: a thread of its own would answer a stream
-some time later, after further pairs have come, and which pairs make a check would then depend on the machine.
+Streams acquire checks, the worker's supervisor books their cost, status reports.
 
-As time passes, the store is filled by the budget less the instalments for windows. Windows are paid in instalments
-because a solve takes seconds: if it were paid at once, no pair would be looked at until that time is earned. Looks are
-paid when they are done. Those who may borrow can take the store down to a debt of the same depth, which is earned again
-before anybody else's turn.
+A check may begin when the token bucket holds enough for it and for all waiting checks with a stronger claim. A
+suspected pair comes first and may borrow. Then comes the pair whose last check is longest ago, counted in its own
+periods. If the budget suffices for all, nobody waits, and every check is made at the pair of frames at which it was
+requested. If it does not, only some of these checks are made, and all periods are stretched by the same factor.
 
-A suspected pair comes first and may borrow. Then comes the pair that has not been looked at for longest, counted in its
-own periods. If the budget suffices for all, nobody waits, and every check is made at the pair of frames at which it was
-asked for. If it does not, only some of these checks are made, and all periods are stretched by the same factor.
+The bucket holds seconds of processor time. As time passes, it is filled by the budget less the instalments for windows.
+Windows are paid in instalments because a solve takes seconds: if it were paid at once, no pair would be checked until
+that time is earned. Checks are paid when they are done. Those who may borrow can take the bucket down to a debt as
+large as its capacity, which is earned again before any other check begins.
 
-It is a state machine without threads or clocks; only sensor time passes in it.
-
-It is one lock around one state machine, held for microseconds. A thread of its own would answer a stream some time
-later, after further pairs have come. Then it would depend on the machine which pairs make a check, even where nobody
-has to wait.
+The scheduler is a state machine without threads or clocks; only sensor time passes in it. `Budget` is one lock around
+it, held for microseconds: a thread of its own would answer a stream some time later, after further pairs have come, and
+which pairs make a check would then depend on the machine.
 """
 
 import math

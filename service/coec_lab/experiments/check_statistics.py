@@ -1,23 +1,17 @@
 """What the change detector makes of checks of rendered drives: shares, delays, and false alarms in hours of driving.
-Checks at one place are not independent: on a highway, if one check is off, the next is off by as much. So hours are
-resampled from whole drives, all of one place for as long as a vehicle stays there. Shuffled checks would be
-independent, and alarms far too few. Resampling cannot show what was never met, so a tail is fitted to the
-displacements of places (peaks over threshold: Pickands 1975; Smith 1987): once as if every drive were a place of
-its own, and once as if a vehicle stayed at each place for ten minutes. All tails count by their likelihood, and the
-detector is run on sampled places of each displacement, where checks scatter as they did on one of the rendered
-drives.
 
-No single check accuses a mount. What accuses it is a place where all checks are off alike, far enough and for long
+No single check raises an alarm. What raises one is a place where all checks are off alike, far enough and for long
 enough. So there are two questions. First, how far off are places? Rendered drives give the displacement of each drive
 on its farthest axis, in standard deviations of `place`; beyond what was seen a tail is fitted (peaks over threshold:
 Pickands 1975; Smith 1987), and all tails count by their likelihood. Second, what does the detector do at a place that
-far off? It is run on drawn places of one displacement, where checks scatter as they did on one of the rendered drives.
+far off? It is run on sampled places of one displacement, where checks scatter as they did on one of the rendered
+drives.
 
 Checks at one place are not independent: on a highway, if one check is off, the next is off by as much. So hours are
 resampled from whole drives, all of one place for as long as a vehicle stays there. Shuffled checks would be
-independent, and alarms far too few. Resampling cannot show what was never met, so a tail is fitted to how far off
-places are (`alarm_bound`): once as if every drive were a place of its own, and once as if a vehicle stayed at each
-place for ten minutes.
+independent, and alarms far too few. Resampling cannot show what was never met, so a tail is fitted to the displacements
+of places (`alarm_bound`): once as if every drive were a place of its own, and once as if a vehicle stayed at each place
+for ten minutes.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""Statistics of the matrix of drives, from rows to figures, and their tables. The claims of an estimate hold if its
-errors, each divided by the claimed sigma, follow a normal distribution of variance one. Errors and sigmas are those
-of the accepted windows, because only these would be served.
+"""Statistics of the matrix of drives, from rows to figures, and their tables.
 
 The claims of an estimate hold if its errors, each divided by the claimed sigma, follow a normal distribution of
 variance one. Errors and sigmas are those of the accepted windows, because only these would be served.

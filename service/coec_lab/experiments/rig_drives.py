@@ -1,10 +1,8 @@
 """`coec sim rig-drives`: rendered drives of a rig on which sensors are displaced, the checks of all pairs as the
-monitor makes them, and the urgent windows that pairs request. All faults of one drive number share a street, so the
-frames of a sensor that did not move are the same in all of them. Every sweep and every picture is prepared once,
-however many pairs use it, and each check becomes evidence for its edge.
+monitor makes them, and the urgent windows that pairs request. Every sweep and every picture is prepared once, however
+many pairs use it, and each check becomes evidence for its edge.
 
-All faults of one drive number share a street, so the frames of a sensor that did not move are the same in all of
-them.
+All faults of one drive number share a street, so the frames of a sensor that did not move are the same in all of them.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

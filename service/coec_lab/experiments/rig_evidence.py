@@ -1,17 +1,11 @@
 """Simulated evidence of a rig: what checks and windows of its pairs report, with all the errors that real ones have.
-Each pair has an estimator with a bias of its own, and one pair has a larger bias than the others. A street
-displaces all checks of a pair alike for as long as it lasts. Single checks scatter with longer tails than the
-attribution assumes; they are bad in runs, faint, late, or missing for a whole drive. Sizes are those of
-`commissioning.baseline`, measured on the recordings; the shares are worse than those seen on simulated drives
-(`monitor.likelihood`). Checks between two LiDARs scatter as on rendered streets, and come when the service would
-have them. When a pair suspects a move, a window is cut at once, and its result counts in addition to the checks
-(`calibration.monitor.urgency`).
 
 Each pair has an estimator with a bias of its own, and one pair has a larger bias than the others. A street displaces
 all checks of a pair alike for as long as it lasts. Single checks scatter with longer tails than the attribution
 assumes; they are bad in runs, faint, late, or missing for a whole drive. Sizes are those of `commissioning.baseline`,
-measured on the recordings; the shares are worse than those seen on simulated drives (`monitor.likelihood`). Looks at
-two LiDARs scatter as on rendered streets, and come when the service would have them.
+measured on the recordings; the shares are worse than those seen on simulated drives (`monitor.likelihood`). Checks
+between two LiDARs scatter as on rendered streets, and come when the service would have them. When a pair suspects a
+move, a window is cut at once, and its result counts in addition to the checks (`calibration.monitor.urgency`).
 """
 
 from __future__ import annotations

@@ -1,21 +1,17 @@
 """Statistics of solves of a window: how well an estimator finds a known pose again from many starts (METHOD, section
 2), whether its errors follow the uncertainty that it claims, and whether two halves of one recording agree.
-Rotation and translation errors, verdicts and efforts are taken over all starts, so that no failure is hidden. Bias
-and spread per axis are taken over the hits alone: a solve that ended in another basin contains no information on
-the width of the true one, and one such solve at 20 degrees would outweigh 199 good ones. The hit rate and the tails
-show how many misses there are and how far off.
 
-The figures of METHOD, section 2. Rotation and translation errors, verdicts and efforts are taken over all starts, so
-that no failure is hidden. Bias and spread per axis are taken over the hits alone: a solve that ended in another basin
-says nothing about the width of the true one, and one such solve at 20 degrees would outweigh 199 good ones. The hit
-rate and the tails show how many misses there are and how far off.
+Rotation and translation errors, verdicts and efforts are taken over all starts, so that no failure is hidden. Bias and
+spread per axis are taken over the hits alone: a solve that ended in another basin contains no information on the width
+of the true one, and one such solve at 20 degrees would outweigh 199 good ones. The hit rate and the tails show how many
+misses there are and how far off.
 
 The two halves share no frame and no start. So their results differ only by the noise of the estimator, and this noise
 must be as large as the standard deviations that the results claim.
 
 An error e with the claimed covariance C gives two figures: per axis e_i / √C_ii, of which 68, 95 and 99.7 % lie within
-1, 2 and 3 if the claim holds and errors are normal; and over all axes the normalised estimation error squared
-eᵀ·C⁻¹·e (NEES), whose mean per axis is 1 (Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and
+1, 2 and 3 if the claim holds and errors are normal; and over all axes the normalised estimation error squared eᵀ·C⁻¹·e
+(NEES), whose mean per axis is 1 (Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and
 navigation", 2001, section 5.4).
 """
 

@@ -1,31 +1,17 @@
 """Sequential tests over checks: the likelihood of the offset of a check if the mount is right and if it has moved,
 tests for a step at some past check to some place, and a test for scatter from one check to the next. Rotations and
-translations are tested separately, three axes each. Plain floats: decisions have to replay to the byte. After Page
-(1954) and Lorden (1971): every check begins a test of "it moved just now" against "it did not", which goes on for
-ever or ends with an alarm. The new place is unknown, so each test learns it as it goes, and predicts every check
-from those before it (Lorden and Pollak 2005, nonanticipating estimation). Under a right mount the likelihood ratio
-of such a test is a martingale, so it reaches e^h in a share of at most e^-h of the tests (Ville). By Lorden's
-theorem the mean run between false alarms is then at least e^h checks: the threshold is the logarithm of a number of
-checks. A right mount is not a point: in every street the optimum lies a little elsewhere, at all neighbouring
-checks alike. Both sides of a test learn where it lies; on the side without a move it may be off by no more than
-streets differ. No test keeps more evidence than the logarithm of how much likelier its place was beforehand as that
-of a moved mount than as that of a right one (the ratio of Savage and Dickey, Dickey 1971). A check is good or bad.
-A good check lies about the mount, Student-distributed. A bad check (a tunnel, an open road, a frame that a lorry
-fills) lies anywhere within reach, or again where the check before it lay if the scene is still the same.
+translations are tested separately, three axes each. Plain floats: decisions have to replay to the byte.
 
 A check is good or bad. A good check lies about the mount, Student-distributed: mostly within its own uncertainty,
 sometimes a few times as far. A bad check (a tunnel, an open road, a frame that a lorry fills) lies anywhere within
 reach, or again where the check before it lay if the scene is still the same. So a single check is worth no more than
 the rarity of bad ones, and checks that contradict each other are worth nothing.
 
-Rotations and translations are treated separately, three axes each. Plain floats: decisions have to replay to the
-byte.
-
 After Page (1954) and Lorden (1971): every check begins a test of "it moved just now" against "it did not", which goes
-on for ever or ends by accusing. The new place is unknown, so each test learns it as it goes, and predicts every check
+on for ever or ends with an alarm. The new place is unknown, so each test learns it as it goes, and predicts every check
 from those before it (Lorden and Pollak 2005, nonanticipating estimation). Under a right mount the likelihood ratio of
 such a test is a martingale, so it reaches e^h in a share of at most e^-h of the tests (Ville). By Lorden's theorem the
-mean run between false accusations is then at least e^h checks: the threshold is the logarithm of a number of checks.
+mean run between false alarms is then at least e^h checks: the threshold is the logarithm of a number of checks.
 
 A right mount is not a point: in every street the optimum lies a little elsewhere, at all neighbouring checks alike.
 Both sides of a test learn where it lies; on the side without a move it may be off by no more than streets differ. So

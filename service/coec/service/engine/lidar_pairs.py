@@ -1,10 +1,8 @@
 """Registers the LiDARs of a vehicle against each other: plans which two of them are registered, takes their sweeps on
-the thread of the intake, submits a registration to the worker, and reports its result to the rig. Only sensor time
-decides which sweeps are taken, and from when their result counts, so a replay of a drive gives the same at any
-rate. The rig waits for everything that counts by its sensor time (`schedule`).
+the thread of the intake, submits a registration to the worker, and reports its result to the rig.
 
 Only sensor time decides which sweeps are taken, and from when their result counts, so a replay of a drive gives the
-same at any rate. The rig waits for everything that counts by its sensor time (`runtime.rig.order`).
+same at any rate. The rig waits for everything that counts by its sensor time (`schedule`).
 """
 
 from collections import Counter, deque

@@ -1,28 +1,17 @@
 """What counts from a sensor time on: the pending results of a pair, in the order in which they were requested, and the
-reports of several pairs, put into one order whatever the order in which they arrive. How long a result takes
-depends on the machine, but what it changes must not. So every request gets, when it is submitted, a sensor time
-from which its result counts in the selection of further frames. The stream waits for the result before it evaluates
-a pair of that time. A replay of a drive is therefore judged in the same way, at any rate and on any machine.
-Results are served the moment they come; only the stream waits. Every request ends: with its result, or when it has
-waited longer than a result may take, so that a lost one does not hold up those behind it. Every report of a pair to
-the rig has such a time, too. A pair that has come to some sensor time has made all its reports that count up to
-there. Reports up to the time that all pairs have passed are taken, in the order of these times; for equal times, in
-the order of the pairs' names. The order does not wait for a pair whose streams have stopped.
+reports of several pairs, put into one order whatever the order in which they arrive.
 
-How long an answer takes depends on the machine, but what it changes must not. So every question gets, when it is asked,
-a sensor time from which its answer counts in the choice of further pairs. The stream waits for the answer before it
-looks at a pair of that time. A replay of a drive is therefore judged in the same way, at any rate and on any machine.
-Answers are served the moment they come; only the stream waits.
+How long a result takes depends on the machine, but what it changes must not. So every request gets, when it is
+submitted, a sensor time from which its result counts in the selection of further frames. The stream waits for the
+result before it evaluates a pair of that time. A replay of a drive is therefore evaluated in the same way, at any rate
+and on any machine. Results are served the moment they come; only the stream waits.
 
-Every question ends: with its answer, or when it has waited longer than an answer may take, so that a lost question does
-not hold up those behind it.
+Every request ends: with its result, or when it has waited longer than a result may take, so that a lost one does not
+hold up those behind it.
 
-Every report has a sensor time from which it counts (`decisions.queue`). A pair that has come to some sensor time has
-made all its reports that count up to there. Reports up to the time that all pairs have passed are taken, in the order
-of these times; for equal times, in the order of the pairs' names. So a replay of a drive gives the same order at any
-rate.
-
-The order does not wait for a pair whose streams have stopped.
+Every report of a pair to the rig has such a time, too. A pair that has come to some sensor time has made all its
+reports that count up to there. Reports up to the time that all pairs have passed are taken, in the order of these
+times; for equal times, in the order of the pairs' names. The order does not wait for a pair whose streams have stopped.
 """
 
 import heapq

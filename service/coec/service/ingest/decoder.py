@@ -1,17 +1,13 @@
 """From a sample to a frame: chooses the decoder, checks frame id, size and number, and follows the senders of the
-stream. Every refusal is counted. Senders: who sends, whether several send at the same time, and how many messages
-of each were lost. ROS publishers name themselves beside each message. Other senders are told apart by the session
-or router that stamped their messages, as far as it did, and by their numbers, or without numbers by their stamps:
-numbers and stamps of one sender go on, while those of two senders alternate between two sequences. A missing number
-counts as lost once it is late, because a frame that was only overtaken comes within a few others. An overtaken
-frame is no loss of the network: if it is dropped later, the part that drops it counts it, once.
+stream. Every refusal is counted.
+
+Senders: who sends, whether several send at the same time, and how many messages of each were lost. ROS publishers name
+themselves beside each message. Other senders are told apart by the session or router that stamped their messages, as
+far as it did, and by their numbers, or without numbers by their stamps: numbers and stamps of one sender go on, while
+those of two senders alternate between two sequences.
 
 A missing number counts as lost once it is late, because a frame that was only overtaken comes within a few others. An
 overtaken frame is no loss of the network: if it is dropped later, the part that drops it counts it, once.
-
-ROS publishers name themselves beside each message. Other senders are told apart by the session or router that stamped
-their messages, as far as it did, and by their numbers, or without numbers by their stamps: numbers and stamps of one
-sender go on, while those of two senders alternate between two sequences.
 """
 
 from __future__ import annotations

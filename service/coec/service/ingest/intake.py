@@ -1,10 +1,7 @@
 """The thread that takes the samples of a vehicle, with its bounded inbox and its streams. It decodes each sample once
 to a frame and hands the frame to every camera-LiDAR pair that uses it. For each of these it gives the next pair of
-frames to the frame selector. There is one thread for all, for three reasons. Its work holds the interpreter nearly
-all the time, so that more threads would only share the same second. Frames are handed on without a lock. And every
-pair sees the samples in the order in which they came. Nothing here waits: not for the disk, not for the worker, not
-for another pair. The inbox between the network's threads and this one is bounded in number for each stream and in
-bytes for all streams together.
+frames to the frame selector. The inbox between the network's threads and this one is bounded in number for each stream
+and in bytes for all streams together.
 
 There is one thread for all, for three reasons. Its work holds the interpreter nearly all the time, so that more threads
 would only share the same second. Frames are handed on without a lock. And every pair sees the samples in the order in

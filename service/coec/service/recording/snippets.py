@@ -1,10 +1,8 @@
 """Snippets, the seconds that a pair recorded around an event: written to the disk a few frames at a time, on a thread
-that has other work to do, and their folder, which is listed, bounded in bytes, and read from. Beside each recording
-lies a description (`.json`), so that a listing opens no recording. No snippet is begun if the disk has too little
-room, because windows come first. A failure here costs only the snippet.
+that has other work to do, and their folder, which is listed, bounded in bytes, and read from.
 
-Beside each recording lies a description (`.json`), so that a listing opens no recording. The folder is bounded in
-bytes. No snippet is begun if the disk has too little room, because windows come first.
+Beside each recording lies a description (`.json`), so that a listing opens no recording. No snippet is begun if the
+disk has too little room, because windows come first. A failure here costs only the snippet.
 """
 
 import hashlib

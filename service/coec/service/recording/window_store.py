@@ -1,13 +1,8 @@
 """The folder of recorded windows: lists them, removes old ones, and reads bytes of a file. Its index keeps what was
-read of them, above all the digest, so that no file is read twice. Queries about what is there are answered from
-memory and do not wait for the disk. Only threads that may wait for the disk, those of the recorders, scan the
-folder (several times a second), write and remove. No single clock decides whether a file is removed. The order of
-recording decides which window is older. A window is too old only if the wall clock says so and also the sensor time
-of a newer window of its pair. Because both may jump together, only a few windows at a time are removed for their
-age.
+read of them, above all the digest, so that no file is read twice.
 
-Questions about what is there are answered from memory and do not wait for the disk. Only threads that may wait for the
-disk, those of the recorders, look at the folder (several times a second), write and remove.
+Queries about what is there are answered from memory and do not wait for the disk. Only threads that may wait for the
+disk, those of the recorders, scan the folder (several times a second), write and remove.
 
 No single clock decides whether a file is removed. The order of recording decides which window is older. A window is too
 old only if the wall clock says so and also the sensor time of a newer window of its pair. Because both may jump

@@ -1,35 +1,24 @@
 """The history of a pair, in three books, and the log of its checks. Each book has its own quota, so that none can push
-out what another holds. - `results`: the estimate of each window, and the extrinsic that was served because of it.
-That is all that a roll back and a commissioning need. - `states`: changes of health, and damage that was detected
-in a book. - `commands`: commands of people, the extrinsics that they put in place, and the outcomes of windows that
-are solved again, which happens only by command. A flood of commands pushes out only entries of this book. Each book
-is a hash chain in a file of its own: append-only, one line per entry, and each entry holds the sha256 of the one
-before, so that tampering shows. The entries of all books are numbered together, in the order in which they came. A
-line is `<sha256 of the entry> <entry, JSON><tab><result, JSON or null>`; the entry names the sha256 of its result.
-Hashes are over the bytes of the line, so that a version with other fields can still verify it. An entry of another
-schema version that this one cannot read stays in its place, byte for byte, with a stand-in to be shown. Only the
-newest `limit` entries are retained; the first line's `previous_sha256` is then the hash of a dropped entry. The
-state file also holds place and hash of the last entry on the disk, so that a missing end is noticed. If a chain is
-broken, its file is quarantined as it is, and the chain goes on from the part that is sound. The log of the
-monitor's checks has one JSON line each. No decision depends on it, so a line that cannot be read is left out.
+out what another holds.
+
+- `results`: the estimate of each window, and the extrinsic that was served because of it. That is all that a roll back
+  and a commissioning need.
+- `states`: changes of health, and damage that was detected in a book.
+- `commands`: commands of people, the extrinsics that they put in place, and the outcomes of windows that are solved
+  again, which happens only by command. A flood of commands pushes out only entries of this book.
+
+Each book is a hash chain in a file of its own: append-only, one line per entry, and each entry holds the sha256 of the
+one before, so that tampering shows. The entries of all books are numbered together, in the order in which they came.
 
 A line is `<sha256 of the entry> <entry, JSON><tab><result, JSON or null>`; the entry names the sha256 of its result.
 Hashes are over the bytes of the line, so that a version with other fields can still verify it. An entry of another
 schema version that this one cannot read stays in its place, byte for byte, with a stand-in to be shown. Only the newest
-`limit` entries are kept; the first line's `previous_sha256` is then the hash of a dropped entry. The state file also
-holds place and hash of the last entry on the disk, so that a missing end is noticed. If a chain is broken, its file is
-kept aside as it is, and the chain goes on from the part that is sound.
+`limit` entries are retained; the first line's `previous_sha256` is then the hash of a dropped entry. The state file
+also holds place and hash of the last entry on the disk, so that a missing end is noticed. If a chain is broken, its
+file is quarantined as it is, and the chain goes on from the part that is sound.
 
-- `results`: the estimate of each window, and the extrinsic that was served because of it. That is all that a roll back
-  and a commissioning need.
-- `states`: changes of health, and damage that was found in a book.
-- `commands`: commands of people, the extrinsics that they put in place, and the outcomes of windows that are solved
-  again, which happens only by command. A flood of commands pushes out only entries of this book.
-
-Each book is a hash chain in a file of its own. The entries of all books are numbered together, in the order in which
-they came.
-
-Only the newest are kept. No decision depends on them, so a line that cannot be read is left out.
+The log of the monitor's checks has one JSON line each, and only the newest are retained. No decision depends on it, so
+a line that cannot be read is left out.
 """
 
 import contextlib

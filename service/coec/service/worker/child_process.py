@@ -1,10 +1,9 @@
 """One worker process, as the supervisor handles it: starts, watches, talks to and ends it; and what ties the two
 processes together: the wire between them, and the child's death with its parent. Every fault of the process is a
-`ChildError`. The wire is one socket pair, with one msgpack map per message, sent in parts. A process that dies may
-leave half a message. So sends and receives have a time limit, and neither end can block for ever on the other.
+`ChildError`.
 
-A process that dies may leave half a message. So sends and receives have a time limit, and neither end can block for
-ever on the other.
+The wire is one socket pair, with one msgpack map per message, sent in parts. A process that dies may leave half a
+message. So sends and receives have a time limit, and neither end can block for ever on the other.
 """
 
 from __future__ import annotations
