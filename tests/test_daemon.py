@@ -73,7 +73,7 @@ STUBBORN = (
 
 @pytest.fixture(scope="module")
 def drive() -> Drive:
-    pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+    pytest.importorskip("embreex", reason="needs embreex")
     return rendered(SHORT)
 
 

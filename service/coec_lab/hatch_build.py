@@ -5,7 +5,7 @@ from typing import Any
 from hatchling.metadata.plugin.interface import MetadataHookInterface
 
 LIBRARIES = ("embreex>=4.4", "matplotlib>=3.9", "numba>=0.61", "numpy>=2.0", "pydantic>=2.12", "rich>=14.3")
-"""What the laboratory imports itself."""
+"""What the laboratory imports itself. embreex is Intel's Embree, the ray casting of the simulated vehicle."""
 
 
 class Dependencies(MetadataHookInterface):

@@ -31,7 +31,7 @@ from campaign.health_timeline import (
 from campaign.test_never_blind import rate
 from coec.io.storage import StateFile
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 pytestmark = pytest.mark.slow
 
 DRIVE = Drive(1, 100)

@@ -25,7 +25,7 @@ from campaign.health_timeline import (
 )
 from campaign.test_never_blind import rate
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 pytestmark = pytest.mark.slow
 
 WRONG_DEG, WRONG_M = 1.0, 0.1

@@ -29,7 +29,7 @@ from campaign.health_timeline import (
     watching,
 )
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 pytestmark = pytest.mark.slow
 
 DRIVE = Drive(1, 100, ("step:40:ry=1",))

@@ -13,7 +13,7 @@ from campaign.figures import Figure, at_most, exactly, is_long, publish
 from campaign.health_timeline import WRONG_DEG, Transition, configured, most_per_minute, transitions, watching
 from campaign.test_never_blind import rate
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 pytestmark = pytest.mark.slow
 
 SETTLED_S = 40

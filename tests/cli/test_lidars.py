@@ -12,7 +12,7 @@ import pytest
 from cli.conftest import Coec
 from support.recordings import Bag, drive_messages
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 
 RIG = "sim:rig=four-fisheyes&seed=61&seconds=3&camera=fisheye32&start_m=40"
 HAS_SEARCH = importlib.util.find_spec("small_gicp") is not None

@@ -216,7 +216,7 @@ SENSORS = ("front", "left", "rear", "right", "roof", "near_left", "near_right")
 
 
 def test_all_sensors_of_a_rig_are_played_on_a_key_each(coec: Coec, listener: Listener) -> None:
-    pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+    pytest.importorskip("embreex", reason="needs embreex")
     outcome = coec("play", RIG, "--connect", listener.endpoint, "--rate", 0, "--json")
     assert outcome.status == 0
     assert outcome.document["frames"] == dict.fromkeys(SENSORS, 1) | {"ego": 2}
@@ -225,7 +225,7 @@ def test_all_sensors_of_a_rig_are_played_on_a_key_each(coec: Coec, listener: Lis
 
 
 def test_all_sensors_of_a_rig_are_played_on_topics_of_their_own(coec: Coec, listener: Listener) -> None:
-    pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+    pytest.importorskip("embreex", reason="needs embreex")
     outcome = coec("play", RIG, "--connect", listener.endpoint, "--rate", 0, "--middleware", "ros2dds", "--json")
     assert outcome.status == 0
     cameras, lidars = SENSORS[:4], SENSORS[4:]

@@ -75,7 +75,7 @@ def lived(**story: object) -> Mapping[str, Any]:
     why = refusal()
     if why is not None:
         pytest.skip(why)
-    pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+    pytest.importorskip("embreex", reason="needs embreex")
     path = os.pathsep.join(str(REPOSITORY / folder) for folder in ("service", "tests"))
     command = [*UNSHARE, sys.executable, "-m", "deploy.vehicle", json.dumps(story)]
     # For a group of its own there is nobody to be left behind: the namespace of processes ends with its first.

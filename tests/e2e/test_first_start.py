@@ -45,7 +45,7 @@ def busy(loops: int) -> Iterator[None]:
 def test_a_first_start_says_that_it_compiles_and_loses_no_window(
     tmp_path: Path, router: Router, monkeypatch: pytest.MonkeyPatch, record_property: Any
 ) -> None:
-    pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+    pytest.importorskip("embreex", reason="needs embreex")
     drive = rendered(SHORT)
     config = write_configuration(tmp_path, drive.recording, router.endpoint, calibration=BY_DEPTH, window=WINDOW)
     monkeypatch.setattr(processes, "PATIENCE_S", 1500.0)

@@ -31,7 +31,7 @@ from e2e.drives import EARLY_STEPPED, NS_PER_S, Drive, rendered
 from e2e.processes import PATIENCE_S, Router, Service, service, write_configuration
 from support.fake_worker import wait_until
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 
 SPEED = 16.0
 """Seconds of driving per second. Whenever the drive begins again the mount is back where it was: a red event twice in

@@ -36,7 +36,7 @@ from e2e.ros_vehicle import (
 )
 from support import ros
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 
 DRIVE = "seed=1&seconds=16&camera=pinhole480x240&lidar=32&camera_hz=1&lidar_hz=1&ego_hz=10"
 PAIRS, SLICE_S = 12, 14

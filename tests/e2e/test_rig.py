@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import zenoh
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 
 from coec.geometry.se3 import inverse, rotation_angle_rad
 from coec.io.zenoh.player import Frame, Player, SensorKeys

@@ -16,7 +16,7 @@ from e2e.processes import Router, Service, by_topics, coec, service, write_confi
 from support.fake_worker import wait_until
 from support.ros import HASHES, RosDriver, cdr_message
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 
 TOPICS = {"camera": "/front/image_raw/compressed", "lidar": "/top/points", "ego": "/odometry"}
 FLOOD = 4200

@@ -35,7 +35,7 @@ from e2e.processes import Router, Service, by_topics, coec, coec_here, service, 
 from support.recordings import MODEL_CARD, first_channel_network
 from support.ros import RosSensors
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 
 SLICES = 2
 """Windows; then a third begins. The kill comes in the last solve: what is solved after a start is served at once, in a

@@ -19,7 +19,7 @@ from e2e.processes import Router, coec, service, write_configuration
 from e2e.test_same_decisions import WORKSHOP, decisions
 from support.recordings import converted
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 
 SLICE_S, SLICES = 12, 2
 FINISHED_S = SLICES * SLICE_S

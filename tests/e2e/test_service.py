@@ -50,7 +50,7 @@ COMPUTED_S = 0.2
 
 @pytest.fixture(scope="module")
 def drive() -> Drive:
-    pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+    pytest.importorskip("embreex", reason="needs embreex")
     return rendered(SHORT)
 
 

@@ -33,7 +33,7 @@ from e2e.processes import PATIENCE_S, Router, Service, service
 from support.readers import read_recording
 from support.router import TestAuthority
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 
 EARLY_SLICE_S = 16.0
 

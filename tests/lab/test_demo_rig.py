@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 
 from dataclasses import replace
 

@@ -18,7 +18,7 @@ from coec.io.recordings.layouts import open_lidars, open_source
 
 pytestmark = pytest.mark.usefixtures("streets")
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 
 SHORT = ("--seed", 4, "--seconds", 0.6, "--camera", "fisheye96", "--lidar", 16, "--camera-hz", 5, "--lidar-hz", 5)
 

@@ -24,7 +24,7 @@ from peers.environments import peer
 from peers.nodes import Inbox, Node, Topic, node, relay
 from peers.test_messages_by_rclpy import has_tf
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 

@@ -27,7 +27,7 @@ from support.fake_worker import wait_until
 
 pytestmark = pytest.mark.slow
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 
 CLIENT = "zenoh-ros2-sdk==0.1.8"
 VEHICLE = Path(__file__).with_name("ros_sdk_vehicle.py")

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from coec.reports import console
 from coec_lab.bench import daemon, kernels, processes
-from coec_lab.simulation.source import require_extra
+from coec_lab.simulation.source import require_embree
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ def run(*, as_json: bool) -> int:
     Raises:
         SourceError: the library that renders the street of one of the solves is not installed.
     """
-    require_extra()
+    require_embree()
     with console.progress(counted=False) as bars:
         document = {"machine": _machine()} | kernels.measure(bars, kernels.Size()) | measure_processes(bars)
     if as_json:

@@ -45,9 +45,9 @@ def rig_drives(
     from coec_lab.experiments import rig_drive_statistics, rig_drives, rig_moves
     from coec_lab.experiments.rig_drives import DisplacedRigDrive
     from coec_lab.experiments.simulation_schemas import RigDriveRow
-    from coec_lab.simulation.source import require_extra
+    from coec_lab.simulation.source import require_embree
 
-    require_extra()
+    require_embree()
     planned = [DisplacedRigDrive(number, camera) for number in range(drives)]
     names = [drive.name for drive in planned]
     rows = resumed(output, names, RigDriveRow)
@@ -135,9 +135,9 @@ def matrix(
     from coec_lab.commands.drive_pool import drive_file, finished, resumed
     from coec_lab.experiments import matrix_drives, matrix_statistics, plots
     from coec_lab.experiments.simulation_schemas import MatrixRow
-    from coec_lab.simulation.source import require_extra
+    from coec_lab.simulation.source import require_embree
 
-    require_extra()
+    require_embree()
     drives, settings = _selected(number, only, None if dof is None else int(dof), frames, depth)
     names = [drive.name for drive in drives]
     rows = resumed(output, names, MatrixRow, lambda row: row.settings == settings.fingerprint)
@@ -219,9 +219,9 @@ def checks(
     from coec_lab.commands.drive_pool import drive_file, finished, resumed
     from coec_lab.experiments import check_drives, check_statistics
     from coec_lab.experiments.simulation_schemas import CheckedDrive
-    from coec_lab.simulation.source import require_extra
+    from coec_lab.simulation.source import require_embree
 
-    require_extra()
+    require_embree()
     series = list(check_drives.drives(rounds, first))
     names = [drive.name for outing in series for drive in outing]
     rows = resumed(output, names, CheckedDrive)
@@ -273,7 +273,7 @@ def _exit(status: int) -> None:
     raise typer.Exit(status)
 
 
-app = typer.Typer(no_args_is_help=True, help="Simulate a vehicle (optional extra `sim`).", result_callback=_exit)
+app = typer.Typer(no_args_is_help=True, help="Simulate a vehicle.", result_callback=_exit)
 
 
 @app.command("drive")

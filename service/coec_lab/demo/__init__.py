@@ -24,9 +24,9 @@ def demo(
 ) -> int:
     """Displace the mount of a simulated vehicle and show the service detect and correct it: no data, two minutes."""
     if rig:
-        from coec_lab.simulation.source import require_extra
+        from coec_lab.simulation.source import require_embree
 
-        require_extra()
+        require_embree()
         from coec_lab.demo import rig as rig_demo
 
         return rig_demo.run(output, as_json=as_json)

@@ -31,7 +31,7 @@ from coec.io.rig_files import intrinsics_config, matrix_rows
 from coec.io.zenoh.player import CAMERA, Frame, Played, Player, StreamKeys
 from coec.schemas import replies
 from coec_lab.demo.service import MIN_FREE_BYTES, STORY_CORES
-from coec_lab.simulation.source import require_extra
+from coec_lab.simulation.source import require_embree
 
 if TYPE_CHECKING:
     from coec_lab.simulation.drive import DriveConfig, SimulatedDrive
@@ -92,7 +92,7 @@ def drive_config() -> DriveConfig:
     Raises:
         SourceError: the library that casts rays is not installed.
     """
-    require_extra()
+    require_embree()
     from coec_lab.simulation.drive import DriveConfig
     from coec_lab.simulation.faults import StepFault
 

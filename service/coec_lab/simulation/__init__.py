@@ -1,5 +1,5 @@
 """A simulated vehicle: a procedural street, cameras and LiDARs rendered in it by ray casting, faults, and the truth.
 
-Needs the optional extra `sim` (embreex: Intel's Embree). World frame: x, y horizontal, z up, metres. Everything follows
+Rays are cast by embreex (Intel's Embree). World frame: x, y horizontal, z up, metres. Everything follows
 from a seed: the same seed gives the same bytes.
 """

@@ -64,7 +64,7 @@ def drive_config_of(query: dict[str, str]) -> DriveConfig:
         UsageError: an unknown key, or a value that does not fit; names the key.
         SourceError: the optional extra is not installed.
     """
-    require_extra()
+    require_embree()
     from coec_lab.simulation.drive import DriveConfig
 
     known = (*NUMBERS, *TEXT_KEYS)
@@ -80,10 +80,10 @@ def drive_config_of(query: dict[str, str]) -> DriveConfig:
     return DriveConfig(**values)  # type: ignore[arg-type]  # checked key by key above
 
 
-def require_extra() -> None:
+def require_embree() -> None:
     """Raises SourceError, which says what to install, if ray casting is not installed."""
     if importlib.util.find_spec("embreex") is None:
-        raise SourceError("a simulated drive needs the optional extra `sim`: pip install 'coec[sim]'")
+        raise SourceError("a simulated drive needs embreex, which coec-lab requires: pip install coec-lab")
 
 
 RIG_KEYS = (
@@ -103,7 +103,7 @@ def open_rig(query: dict[str, str]) -> RigDrive:
         UsageError: an unknown key, or a value that does not fit; names the key.
         SourceError: the optional extra is not installed.
     """
-    require_extra()
+    require_embree()
     from coec_lab.simulation.rig_drive import RIGS, RigDrive, RigDriveConfig
 
     if unknown := sorted(set(query) - set(RIG_KEYS)):

@@ -1,6 +1,6 @@
 """The built-in depth network `street`: its rendered streets, the network, its training, its export.
 
-It was trained without any photograph. Anyone can train it again (with extras `sim` and `train`; an hour on two cores):
+It was trained without any photograph. Anyone can train it again (extra `train` of coec-lab; an hour on two cores):
 
     python -m coec_lab.training render FRAMES
     python -m coec_lab.training train FRAMES street.pt

@@ -22,7 +22,7 @@ from coec.geometry import se3
 from coec.io.images import GreyImages
 from support.simulated_drives import rendered_source
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 
 DRIVE = "sim:seed=41&seconds=26&camera_hz=1&lidar_hz=1&ego_hz=20&camera=pinhole480x240&lidar=32&depth=yes"
 LIMIT_S = 15.0

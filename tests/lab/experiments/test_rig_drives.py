@@ -8,7 +8,7 @@ from math import radians
 import numpy as np
 import pytest
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 
 from coec.calibration.types import Matrix4
 from coec.geometry import se3

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 
 from coec_lab.simulation.lidar_model import LIDARS, LidarModel, Raster, Rosette, Turn, even_deg, sweep
 from coec_lab.simulation.mesh import Material, Mesh, join, quads

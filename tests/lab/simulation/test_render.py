@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 
 from coec.geometry import cameras
 from coec.geometry.projection import unproject

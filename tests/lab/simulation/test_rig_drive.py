@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame

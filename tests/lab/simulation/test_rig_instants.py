@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 
 from dataclasses import replace
 

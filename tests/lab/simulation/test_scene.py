@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 
 from coec_lab.simulation.road import build_road
 from coec_lab.simulation.scene import AHEAD, BEHIND, MISSED, Town

@@ -33,19 +33,19 @@ from coec_lab.simulation import source
     ],
 )
 def test_what_does_not_fit_is_refused(text: str, reported: str) -> None:
-    pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+    pytest.importorskip("embreex", reason="needs embreex")
     with pytest.raises(UsageError, match=reported):
         open_source(text)
 
 
-def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_embree_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "embreex", None)
-    with pytest.raises(SourceError, match=r"pip install 'coec\[sim\]'"):
+    with pytest.raises(SourceError, match=r"pip install coec-lab"):
         source.open_sim({})
 
 
 def test_the_question_mark_may_be_left_out() -> None:
-    pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+    pytest.importorskip("embreex", reason="needs embreex")
     for text in ("sim:seed=3&seconds=1&camera=fisheye64&lidar=16", "sim:?seed=3&seconds=1&camera=fisheye64&lidar=16"):
         recording = open_source(text)
         assert recording.name == "simulated drive, seed 3"

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("embreex", reason="needs the optional extra `sim`")
+pytest.importorskip("embreex", reason="needs embreex")
 
 from coec.calibration.types import CameraFrame, DepthModel, EncodedImage, ImageFormat
 from coec.config import DepthConfig, LimitsConfig

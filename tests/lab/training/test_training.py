@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("torch", reason="needs the optional extra `train`")
-pytest.importorskip("onnx", reason="needs the optional extra `train`")
+pytest.importorskip("torch", reason="needs the extra `train` of coec-lab")
+pytest.importorskip("onnx", reason="needs the extra `train` of coec-lab")
 
 import torch
 

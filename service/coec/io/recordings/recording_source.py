@@ -169,7 +169,7 @@ FORMS = """accepted forms of a source:
   kitti360:ROOT?drive=...&camera=image_00       KITTI-360 in its official folders
   kitti-raw:ROOT?drive=...&camera=image_02      KITTI raw in its official folders, or one drive with its calib_*.txt
   FOLDER or dataset.yaml                        images and clouds listed in a manifest
-  sim:seed=1&seconds=60&camera=fisheye700&...   a seeded drive through a town that does not exist (extra `sim`)
+  sim:seed=1&seconds=60&camera=fisheye700&...   a seeded drive through a town that does not exist (needs coec-lab)
   sim:rig=four-fisheyes&pair=front-roof&...     one pair of a simulated rig"""
 
 LAYOUTS = ("kitti360", "kitti-raw", "sim")
