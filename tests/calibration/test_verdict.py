@@ -184,7 +184,7 @@ def test_a_knock_within_the_window_refuses_it_and_says_when() -> None:
     verdict = verdict_after(changed())
     (reason,) = verdict.reasons
     assert reason.code == "moved_within_window"
-    assert "the camera moved while the window was taken, by 1.0° between 20.4 and 21.6 s: 9, limit" in reason.text
+    assert "the camera moved while the window was recorded, by 1.0° between 20.4 and 21.6 s: 9, limit" in reason.text
 
 
 @pytest.mark.parametrize(

@@ -82,4 +82,4 @@ def test_a_silent_stream_is_reported_with_who_is_there_and_two_senders_by_name()
     assert "no publisher" not in unheard.text
     senders, clock = [one.text for one in result if one.check == "senders"]
     assert senders.startswith("2 publishers send on /front/image at the same time: /left, /right.")
-    assert "the stamp from the sender's clock" in clock
+    assert "the clock of the sender stamps them" in clock

@@ -39,7 +39,7 @@ def test_lidars_that_see_nothing_in_common_say_so(coec: Coec) -> None:
     source = f"{RIG}&faults=near_left:beams:0:share=0.97"
     outcome = coec("lidars", source, "roof", "near_left", "--pairs", 1)
     assert outcome.status == 1
-    assert "too little in view in common" in outcome.out
+    assert "overlap too little" in outcome.out
     assert "sigma" in outcome.out
 
 

@@ -154,7 +154,8 @@ def test_of_a_rig_that_fits_no_loop_is_called_open(capsys: pytest.CaptureFixture
 
 def test_of_a_rig_that_nobody_checked_no_figure_is_made_up(capsys: pytest.CaptureFixture[str]) -> None:
     message = reported_of_rig(capsys, reply_before_checks())
-    assert "shuttle-7 nothing was looked at yet one_pair: One pair cannot tell its camera from its LiDAR." in message
+    reason = "one_pair: One pair cannot distinguish a move of its camera from one of its LiDAR."
+    assert f"shuttle-7 nothing was looked at yet {reason}" in message
     assert "unknown" in message
     assert "put right" not in message
     assert "1970" not in message

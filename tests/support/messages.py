@@ -40,14 +40,14 @@ def sensor_reply(name: str, kind: SensorKind, state: SensorState, **more: Any) -
         "since_ns": 4 * NS,
         "moved": None,
         "pairs": ("front", "left") if kind == "lidar" else (name,),
-        "reasons": (Reason(code="fits", text=f"The pairs that were looked at fit without a move of {name}."),),
+        "reasons": (Reason(code="fits", text=f"The checked pairs fit without a move of {name}."),),
     }
     return SensorReply(name=name, kind=kind, state=state, **{**fields, **more})
 
 
 def moved_lidar_sensor() -> SensorReply:
     """It turned by a degree."""
-    why = (Reason(code="moved", text="It moved by 1.00°: seen by front, left; all else fits (99.8 %)."),)
+    why = (Reason(code="moved", text="It moved by 1.00°: measured by front, left; all else fits (99.8 %)."),)
     return sensor_reply("roof", "lidar", "lidar_moved", probability=0.998, moved=MOVE, reasons=why)
 
 
@@ -87,7 +87,7 @@ def moved_lidar_reply(**more: Any) -> RigReply:
 
 def reply_before_checks() -> RigReply:
     """Before anything was looked at."""
-    why = (Reason(code="one_pair", text="One pair cannot tell its camera from its LiDAR."),)
+    why = (Reason(code="one_pair", text="One pair cannot distinguish a move of its camera from one of its LiDAR."),)
     sensors = (sensor_reply("roof", "lidar", "unknown", probability=None, since_ns=None, reasons=why),)
     nothing: dict[str, Any] = dict.fromkeys(("stamp_ns", "nobody", "joint", "correction", "move"))
     return moved_lidar_reply(sensors=sensors, reasons=why, losses={}, **nothing)

@@ -29,8 +29,8 @@ class DiagnosticFigure:
 
 
 _MORE_SCENES = "Take a longer window, in motion, past objects at different distances."
-_MORE_STRUCTURE = "Take a window where buildings, poles or parked cars are in reach; see that lens and mask are clean."
-_CALIBRATE = "Calibrate: `coec calibrate` on a window of this mount tells where the camera is."
+_MORE_STRUCTURE = "Take a window where buildings, poles or parked cars are within range; check lens and mask."
+_CALIBRATE = "Calibrate: `coec calibrate` on a window of this mount measures the extrinsic."
 _COMPARE_ONLY = "Nothing: the paper's figures are reported for comparison only; the edges decide."
 
 FIGURES: Mapping[str, DiagnosticFigure] = MappingProxyType(
@@ -41,28 +41,28 @@ FIGURES: Mapping[str, DiagnosticFigure] = MappingProxyType(
             "",
             "Mutual information of the LiDAR's ranges with the depth maps of their own frames, over that with the maps "
             "of other frames. 1 is chance.",
-            "depth and LiDAR agree no better than a cloud with the depth map of another frame",
-            "Try a depth network that suits the scene (see `coec models assess`), or a window with more in reach.",
+            "ranges and depth maps of the same frame agree no better than those of different frames",
+            "Try a depth network that suits the scene (see `coec models assess`), or a window with more structure.",
         ),
         "range_edges": DiagnosticFigure(
             "Range edges",
             "",
-            "Independent jumps in range in the sweeps of the window: what the edges of the images are held against.",
-            "too little structure: the sweeps have too few independent jumps in range",
+            "Independent range edges in the sweeps of the window, which are compared with the edges of the images.",
+            "the sweeps have too few independent range edges",
             _MORE_SCENES,
         ),
         "edge_contrast": DiagnosticFigure(
             "Edge contrast",
             "σ",
             "How far the edge score at the result stands above that at other poses, in standard deviations of those.",
-            "no pose stands out from the others",
+            "the best pose does not score significantly higher than the others",
             _MORE_STRUCTURE,
         ),
         "runner_up": DiagnosticFigure(
             "Runner-up",
             "",
             "Edge contrast of the next best pose over that of the best one. 1 is a draw.",
-            "ambiguous: another pose explains the window nearly as well",
+            "ambiguous: another pose scores nearly as high",
             "Start nearer to the truth, or take a longer window with other scenes in it.",
         ),
         "edges_once": DiagnosticFigure(
@@ -70,20 +70,20 @@ FIGURES: Mapping[str, DiagnosticFigure] = MappingProxyType(
             "σ",
             "How significantly the LiDAR's edges lie on those of the images while the vehicle drives. What all frames "
             "have in common is counted once.",
-            "what fits is the same in all frames although the vehicle drives: lines along the road fit one another",
-            "Take a window that passes other things: houses, cars, posts and trees within reach of the LiDAR.",
+            "the matched edges are the same in all frames although the vehicle drives, as lines along its road are",
+            "Take a window past other objects: houses, cars, posts and trees within range of the LiDAR.",
         ),
         "newton_step_deg": DiagnosticFigure(
             "Slope left, rotation",
             "°",
-            "How far each rotation axis alone would still go to its maximum; the largest of them.",
+            "Newton step from the result to the maximum on each rotation axis alone; the largest of them.",
             "the objective is not at a maximum on every rotation axis",
             "Calibrate again from this result, or take a window with more frames.",
         ),
         "newton_step_m": DiagnosticFigure(
             "Slope left, translation",
             "m",
-            "How far each translation axis alone would still go to its maximum; the largest of them.",
+            "Newton step from the result to the maximum on each translation axis alone; the largest of them.",
             "the objective is not at a maximum on every translation axis",
             "Calibrate again from this result, or search the rotation only.",
         ),
@@ -92,21 +92,21 @@ FIGURES: Mapping[str, DiagnosticFigure] = MappingProxyType(
             "1/°²",
             "How sharply the objective falls off beside the result, as a share of its height, on the flattest rotation "
             "axis.",
-            "the objective is too flat on at least one rotation axis",
+            "the objective has too little curvature on at least one rotation axis",
             _MORE_SCENES,
         ),
         "sigma_deg": DiagnosticFigure(
             "σ, rotation",
             "°",
             "Standard deviation of the least certain rotation axis.",
-            "what was seen does not determine every rotation axis, or is too little to say",
+            "the standard deviation of at least one rotation axis is too large or unknown",
             _MORE_SCENES,
         ),
         "sigma_m": DiagnosticFigure(
             "σ, translation",
             "m",
             "Standard deviation of the least certain translation axis.",
-            "what was seen does not determine every translation axis, or is too little to say",
+            "the standard deviation of at least one translation axis is too large or unknown",
             "Take a longer window with objects near the camera, or search the rotation only.",
         ),
         "overlap": DiagnosticFigure(
@@ -114,106 +114,106 @@ FIGURES: Mapping[str, DiagnosticFigure] = MappingProxyType(
             "",
             "LiDAR points in view, over the most that any pose within reach would have in view.",
             "too few LiDAR points are in view",
-            "See that the nominal extrinsic, the image size and the mask are those of this camera.",
+            "Check that the nominal extrinsic, the image size and the mask are those of this camera.",
         ),
         MOVED: DiagnosticFigure(
             "Moved within the window",
             "σ",
             "What two poses, one after the other, score more than one pose for all frames.",
-            "the camera moved while the window was taken",
-            "See that the mount is tight, and take another window: no single pose is right for this one.",
+            "the camera moved while the window was recorded",
+            "Check that the mount is tight, and take another window: no single pose is correct for this one.",
         ),
         INTRINSICS_OFF: DiagnosticFigure(
             "Other intrinsics",
             "",
-            "How certainly another lens explains the window better than the intrinsics that are given.",
-            "another lens explains the window better than the intrinsics of the rig",
-            "Calibrate the intrinsics anew: no extrinsic makes up for wrong ones.",
+            "How certainly other intrinsics explain the window better than those of the rig.",
+            "other intrinsics explain the window better than those of the rig",
+            "Calibrate the intrinsics again: no extrinsic compensates wrong ones.",
         ),
         # Of a check.
         "mi": DiagnosticFigure(
             "Mutual information",
             "nats",
             "MI of the paper's equation (1), of LiDAR ranges and depth maps at the extrinsic that is checked.",
-            "depth and LiDAR agree less than when the rig was commissioned",
+            "the mutual information of ranges and depth maps is lower than when the rig was commissioned",
             _COMPARE_ONLY,
         ),
         "f1": DiagnosticFigure(
             "Slope of MI",
             "nats/rad",
             "First derivative f' of the paper's equation (2); zero at a maximum.",
-            "mutual information rises beside the extrinsic",
+            "mutual information has no maximum at the extrinsic",
             _COMPARE_ONLY,
         ),
         "f2": DiagnosticFigure(
             "Curvature of MI",
             "nats/rad²",
             "Second derivative f'' of the paper's equation (2); high at a sharp maximum.",
-            "mutual information is flat about the extrinsic",
+            "mutual information has too little curvature at the extrinsic",
             _COMPARE_ONLY,
         ),
         "agreement_deg": DiagnosticFigure(
-            "Agreement of the witnesses",
+            "Agreement of edges and depth",
             "°",
             "Rotation between where the edges fit best and where depth does.",
-            "edges and depth put the camera in different places",
-            "See whether the depth network suits the scene (`coec models assess`); the edges decide.",
+            "edges and depth have their optima at different rotations",
+            "Check whether the depth network suits the scene (`coec models assess`); the edges decide.",
         ),
         "distance_rotation": DiagnosticFigure(
             "Distance, rotation",
             "of its limit",
             "How far the rotation at which the edges fit best is from the extrinsic, squared and in the standard "
             "deviations of a check.",
-            "the edges fit best at another rotation, farther away than they do when the extrinsic is right",
+            "the optimum over rotations is farther from the extrinsic than it is for a correct one",
             _CALIBRATE,
         ),
         "distance_pose": DiagnosticFigure(
             "Distance, pose",
             "of its limit",
             "Likewise of rotation and translation together, on the axis that is farthest off.",
-            "the edges fit best at another pose, farther away than they do when the extrinsic is right",
+            "the optimum over all axes is farther from the extrinsic than it is for a correct one",
             _CALIBRATE,
         ),
         "edge_score": DiagnosticFigure(
             "Edge score",
             "σ",
             "How strongly the image has edges where the LiDAR has them, at the extrinsic that is checked.",
-            "the image has hardly any edges where the LiDAR has them",
+            "the image has almost no edges at the range edges of the LiDAR",
             _MORE_STRUCTURE,
         ),
         "edges_per_pair": DiagnosticFigure(
             "Edges per pair",
             "σ",
             "The same where the edges fit best, for each pair of frames.",
-            "the edges are fainter than a check can rely on: it counts less",
+            "the edges are faint, so the check counts less",
             _MORE_STRUCTURE,
         ),
         "edges_kept_rotation": DiagnosticFigure(
             "Edges kept, rotation",
             "",
             "Edge score at the extrinsic, over that at the rotation that fits best. 1: nothing is gained by turning.",
-            "turning the camera gains more edges than chance does",
+            "another rotation gains more edge score than chance does",
             _CALIBRATE,
         ),
         "edges_kept_pose": DiagnosticFigure(
             "Edges kept, pose",
             "",
             "Edge score at the extrinsic, over that at the pose that fits best. 1: nothing is gained by moving.",
-            "moving the camera gains more edges than chance does",
+            "another pose gains more edge score than chance does",
             _CALIBRATE,
         ),
         "certainty_rotation": DiagnosticFigure(
             "Certainty, rotation",
             "σ",
             "How certainly another rotation gains more than the frames differ from one another.",
-            "the frames insist on another rotation",
+            "the frames agree on another rotation",
             _CALIBRATE,
         ),
         "certainty_pose": DiagnosticFigure(
             "Certainty, pose",
             "σ",
             "How certainly another pose gains more than the frames differ from one another.",
-            "the frames insist on another pose",
+            "the frames agree on another pose",
             _CALIBRATE,
         ),
     }
@@ -224,7 +224,7 @@ OTHER_ADVICE: Mapping[str, str] = MappingProxyType(
     {
         StopReason.AT_BOUND.value: "Start nearer to the truth, or widen the search (`search.rotation_deg`).",
         StopReason.EVALUATIONS.value: "Start nearer, or allow more evaluations (`search.max_evaluations`).",
-        "motion": "Take the window while the vehicle drives past things, not where it stands or sees its road alone.",
+        "motion": "Take the window while the vehicle drives past objects, not where it stands or sees its road alone.",
     }
 )
 """What to do about those reasons of a verdict that are not figures, by their code."""

@@ -46,19 +46,19 @@ NOT_ACQUITTED = "not_acquitted"
 LAST_KNOWN = "last_known"
 """Code of the reason that says what was last known before checks stopped."""
 
-RESTARTED = Reason("restarted", "The service was started again; nothing has been looked at since.")
+RESTARTED = Reason("restarted", "The service was restarted; no check has been completed since.")
 
 SETTLING_NS = 60_000_000_000
 """Sensor time, a minute, for which a pair stays degraded or suspect at least once its data could not be judged, or no
 check acquitted it. Poor stretches that follow each other then count as one, and readers of health do not see two
 changes a minute."""
 
-SETTLING = Reason("settling", "The data can be judged again, after a stretch where they could not.")
+SETTLING = Reason("settling", "The data can be evaluated again, after an interval in which they could not.")
 
 TRANSLATION_OPEN = Reason(
     "translation_open",
-    "The checks see a displacement of the mount, and the latest window, with `search.dof: 3`, cannot judge it; "
-    "calibrate with 6 degrees of freedom, or see that the mount is where it was.",
+    "The checks detect a displacement of the mount, and the latest window, with `search.dof: 3`, cannot confirm it; "
+    "calibrate with 6 degrees of freedom, or inspect the mount.",
 )
 """A window that searches rotations alone is accepted while checks accuse the translation."""
 
@@ -265,7 +265,7 @@ def after_estimate(
     state = replace(state, track=track)
     if track.step is StepState.SUSPECTED and track.candidate is not None:
         step = state_machine.step_between(state.T_camera_lidar, track.candidate.T_camera_lidar)
-        why = Reason("step_suspected", f"The latest window differs by {_step_text(step)}; the next one decides.")
+        why = Reason("step_suspected", f"The latest window differs by {_step_text(step)}; the next window decides.")
         pending = PendingEstimate(track.candidate.T_camera_lidar, estimate, why, contradicts=True)
         return _unless_red(replace(state, pending=pending), HealthEvent.STEP_SUSPECTED, why)
     # A track of one window has that window's pose to the last bit.
@@ -365,7 +365,7 @@ def _applied_or_waiting(
     past = state_machine.remembered(state.changes, estimate.data_stamp_ns)
     waits = state_machine.objection(step, past, estimate.data_stamp_ns, rules.policy)
     if state.hold is not None:
-        waits = Reason("held", "The extrinsic is held by command: the candidate waits for its release.")
+        waits = Reason("held", "The extrinsic is held by command; the candidate waits for its release.")
     if waits is None:
         change = state_machine.AppliedChange(estimate.data_stamp_ns, tuple(abs(float(value)) for value in step))
         served = replace(_served(state, pose, estimate), changes=(*past, change))
@@ -374,7 +374,7 @@ def _applied_or_waiting(
     state = replace(state, pending=PendingEstimate(pose, estimate, waits, contradicts=not close))
     if close:
         return _confirmed(state, state.T_camera_lidar, estimate, stamp_ns, rules, now_ns)
-    why = Reason("candidate_waits", f"An accepted window differs by {_step_text(step)} from what is served.")
+    why = Reason("candidate_waits", f"An accepted window differs by {_step_text(step)} from the served extrinsic.")
     return happened(state, HealthEvent.CONTRADICTED, why, waits)
 
 
@@ -415,7 +415,7 @@ def _confirmed(
         event = HealthEvent.MOUNT_MOVED if monitor.outcome is MonitorOutcome.CONFIRMED else HealthEvent.SUSPECTED
         return _unless_red(state, event, TRANSLATION_OPEN)
     if not is_acquitted(monitor, stamp_ns if now_ns is None else now_ns, rules.monitor):
-        text = "A window confirms the extrinsic, but its last pairs are old; no check has acquitted it since."
+        text = "A window confirms the extrinsic, but its last pairs are old; no check has confirmed it since."
         return happened(state, HealthEvent.CONFIRMED_EARLIER, Reason(NOT_ACQUITTED, text))
     cause = _data_cause(monitor)
     if cause is None:
@@ -449,10 +449,10 @@ def after_observation(state: PairState, observation: Observation, rules: PairRul
     if monitor.outcome is MonitorOutcome.CONFIRMED:
         return happened(state, HealthEvent.MOUNT_MOVED, CAUSES[BENT_MOUNT].as_reason())
     if monitor.outcome is MonitorOutcome.SUSPECT:
-        text = "The latest pairs do not fit the extrinsic that is served; a window is being taken to decide."
+        text = "The latest pairs do not fit the served extrinsic; a window is being recorded to decide."
         return _unless_red(state, HealthEvent.SUSPECTED, Reason("monitor_suspects", text))
     if monitor.outcome is MonitorOutcome.AT_ODDS:
-        text = "The latest checks accuse the mount, but do not add up to a move; a window is being taken to decide."
+        text = "The latest checks contradict the extrinsic and each other; a window is being recorded to decide."
         return _poor(state, HealthEvent.AT_ODDS, observation.stamp_ns, Reason("checks_at_odds", text))
     if monitor.unacquitted > 0:
         return _not_renewed(state, observation, rules)
@@ -461,7 +461,8 @@ def after_observation(state: PairState, observation: Observation, rules: PairRul
         if state.proven:
             return _well_again(state, HealthEvent.CLEAR, observation.stamp_ns)
         after = _well_again(state, HealthEvent.NO_OBJECTION, observation.stamp_ns, NOT_EVALUATED)
-        return after if after.health is not state.seen or after.reasons == (SETTLING,) else _seen_again(state)
+        settles = [reason.code for reason in after.reasons] == [SETTLING.code]
+        return after if settles or after.health is not state.seen else _seen_again(state)
     return state
 
 
@@ -476,7 +477,7 @@ def _not_renewed(state: PairState, observation: Observation, rules: PairRules) -
     least = {BENT_MOUNT: BLIND_AT}
     cause = leading_cause({code: weight for code, weight in monitor.blind.items() if weight >= least.get(code, 1.0)})
     if cause is not None and cause.code == BENT_MOUNT:
-        text = "The latest checks accuse the mount, and none acquits it."
+        text = "The latest checks contradict the extrinsic, and none confirms it."
         return _poor(state, HealthEvent.SUSPECTED, observation.stamp_ns, Reason("monitor_suspects", text))
     text = "No check of the latest pairs can confirm the extrinsic: their edges are faint, or do not fit well enough."
     why = Reason(NOT_ACQUITTED, text) if cause is None else cause.as_reason()
@@ -552,7 +553,7 @@ def time_stepped_back(state: PairState, stamp_ns: int) -> PairState:
         poor_since_ns=None,
         monitor=replace(state.monitor, last_stamps_ns=(), acquitted_ns=None, unacquitted=0, standstill=None),
     )
-    why = Reason("time_stepped_back", "The clock of the sensors stepped back; nothing has been looked at since.")
+    why = Reason("time_stepped_back", "The clock of the sensors stepped back; no check has been completed since.")
     return _unseen(state, HealthEvent.TIME_STEPPED_BACK, why)
 
 

@@ -53,10 +53,10 @@ SAME_SCENE = 0.5
 
 
 _CONTRADICTED = {
-    nuisance_parameters.HELD_FREE: "with the held centre",
-    nuisance_parameters.CLOCKS_FREE: "with the clocks",
+    nuisance_parameters.HELD_FREE: "the held centre",
+    nuisance_parameters.CLOCKS_FREE: "the time offset",
 }
-"""With what a window disagrees if relaxing this assumption turns the camera."""
+"""What a window contradicts if relaxing this assumption turns the camera."""
 
 
 def saw_one_scene(independent_samples: float, frames: int) -> bool:
@@ -168,7 +168,7 @@ def reason_details(
 def _contradictions_text(relaxed: Sequence[nuisance_parameters.RelaxedAssumption]) -> str:
     """Which assumptions the window contradicts, and by how much the camera turns without each."""
     turns = [
-        f"{_CONTRADICTED[one.name]} set free, it turns by {degrees(float(np.linalg.norm(one.shift[:3]))):.1f}°"
+        f"estimating {_CONTRADICTED[one.name]}, too, turns it by {degrees(float(np.linalg.norm(one.shift[:3]))):.1f}°"
         for one in relaxed
         if one.contradicts and one.name in _CONTRADICTED
     ]
@@ -181,8 +181,8 @@ def _lens_text(relaxed: Sequence[nuisance_parameters.RelaxedAssumption], window:
         return ""
     (right, down, longer), camera = lens[0].tolist(), window.rig.camera
     return (
-        f", a focal length {100.0 * longer:+.1f} % and a principal point {right * camera.fx:+.1f} px across and "
-        f"{down * camera.fy:+.1f} px down from it"
+        f" (focal length {100.0 * longer:+.1f} %, principal point {right * camera.fx:+.1f} px right and "
+        f"{down * camera.fy:+.1f} px down)"
     )
 
 
@@ -222,9 +222,11 @@ def judge(
         if not metric.passed
     ]
     if stop is not StopReason.TOLERANCE:
-        reasons.append(Reason(stop.value, "the search did not end inside its box: the true pose may lie outside"))
+        reasons.append(
+            Reason(stop.value, "the search did not converge within its bounds, so the true pose may lie outside")
+        )
     if saw_one_scene(independent_samples, frames) and any(reason.code in UNCERTAIN for reason in reasons):
-        count = f"{frames} frames are worth {independent_samples:.1f} independent ones"
-        text = f"{count}: a window past other things would settle more"
+        count = f"{frames} frames are worth {independent_samples:.1f} independent samples"
+        text = f"{count}: take a window while the vehicle drives past other objects"
         reasons.append(Reason("motion", text))
     return Verdict(Decision.FAILED if reasons else Decision.ACCEPTED, metrics, tuple(reasons))

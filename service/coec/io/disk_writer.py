@@ -106,7 +106,7 @@ class DiskWriter:
         started_s, failure = self._started_s, self._failure
         silent_s = 0.0 if started_s is None else time.monotonic() - started_s
         if silent_s > SLOW_S:
-            text = f"The disk of {self._folder} has been busy for {silent_s:.0f} s: what is decided is not on it yet."
+            text = f"The disk of {self._folder} has been busy for {silent_s:.0f} s: decisions are not stored yet."
             return Reason("disk_slow", text)
         return failure or self._space
 
@@ -164,7 +164,7 @@ class DiskWriter:
         try:
             status = os.statvfs(self._folder)
         except OSError as error:
-            self._space = Reason("disk_failing", f"The folder {self._folder} cannot be looked at: {error.strerror}.")
+            self._space = Reason("disk_failing", f"The folder {self._folder} cannot be read: {error.strerror}.")
             return
         if status.f_flag & os.ST_RDONLY:
             text = f"The disk of {self._folder} is read-only ({os.strerror(errno.EROFS)}): nothing can be kept."

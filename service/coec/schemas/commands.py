@@ -58,7 +58,7 @@ def arguments_of(command: str, *, for_rig: bool) -> tuple[Argument, ...]:
 
 
 class ProvenCommand(Message):
-    """What the sender of a command says inside a TLS conversation (`command/<name>?tls=<conversation>`)."""
+    """What the sender of a command sends inside a TLS conversation (`command/<name>?tls=<conversation>`)."""
 
     selector: str = Field(
         description="key and parameters of the command, as in a query without proof, so that nobody can redirect it to "

@@ -66,7 +66,7 @@ class Finding(Part):
     check: Text = Field(description="what was checked, one of a fixed set of words")
     level: Level = Field(description="fail: the service cannot work like this; warn: it can, but needs attention")
     where: Text = Field(description="file, endpoint, key or pair; empty for the computer as a whole")
-    text: Text = Field(description="what was found, one sentence")
+    text: Text = Field(description="result of the check, one sentence")
     advice: Text | None = Field(default=None, description="what to do about it; null if there is nothing to do")
 
 

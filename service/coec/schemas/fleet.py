@@ -20,7 +20,7 @@ SEEN = (0.5, 0.5, 0.5, 0.1, 0.1, 0.1)
 
 
 class WindowRow(Message):
-    """A window of a batch, kept until it becomes a row of a table. It holds either a result or an error."""
+    """A window of a batch, stored until it becomes a row of a table. It holds either a result or an error."""
 
     url: Text = Field(description="where the window was found; its name in the batch")
     sha256: Text | None = Field(description="hash of the whole file, hexadecimal; null if it could not be read")
@@ -41,7 +41,7 @@ class BatchReport(Message):
 
     output: Text = Field(description="folder of the tables")
     windows: Count = Field(description="windows of the batch")
-    kept: Count = Field(description="windows that were judged before this run")
+    kept: Count = Field(description="windows that were evaluated before this run")
     accepted: Count
     refused: Count
     errors: Counts = Field(description="windows without a result, by code")
@@ -55,7 +55,7 @@ class BatchReport(Message):
 
 
 class DayOfPair(Part):
-    """Accepted windows of a pair on one day; null on axes that none of them told."""
+    """Accepted windows of a pair on one day; null on axes that none of them determines."""
 
     date: Text = Field(description="UTC, such as 2026-11-22")
     windows: Count
@@ -73,10 +73,10 @@ class PairOfFleet(Part):
     accepted: Count
     errors: Count = Field(description="windows without a result")
     last_ns: int | None = Field(description="stamp of the last window with a result, ns")
-    latest: Maybe6 = Field(description="median of the last accepted windows; null on axes that they do not tell")
+    latest: Maybe6 = Field(description="median of the last accepted windows; null on axes that they do not determine")
     drift: Maybe6 = Field(description="`latest` minus the median of as many windows that were accepted first")
     slope: Maybe6 = Field(description="slope of the corrections over time, per 30 days; null with windows of one day")
-    worst: Text | None = Field(description="axis that drifted furthest, in steps that a monitor has to detect")
+    worst: Text | None = Field(description="axis with the largest drift, in steps that a monitor has to detect")
     urgency: float = Field(ge=0, description="drift of that axis in such steps")
     days: tuple[DayOfPair, ...]
 
@@ -118,13 +118,13 @@ class FleetChanges(Part):
 
 
 class FalseAlarms(Part):
-    """What became of the alarms of a fleet's pairs, according to their last words."""
+    """Outcomes of the alarms of a fleet's pairs, according to their heartbeats."""
 
-    pairs: Count = Field(description="pairs whose last word counts alarms")
+    pairs: Count = Field(description="pairs whose heartbeat counts alarms")
     watched_h: float = Field(ge=0, description="sensor time between completed checks, summed over all pairs, h")
     confirmed: Count = Field(description="alarms that ended with another extrinsic")
-    withdrawn: Count = Field(description="false alarms: they ended with the extrinsic that they had accused")
-    per_100_h: float | None = Field(description="false alarms per 100 h of a pair; null if nothing was watched")
+    withdrawn: Count = Field(description="false alarms: they ended with the extrinsic that they had rejected")
+    per_100_h: float | None = Field(description="false alarms per 100 h of a pair; null if nothing was monitored")
     per_100_h_at_most: float | None = Field(description="upper bound of that rate, exceeded once in twenty (Poisson)")
     by_pair: dict[Text, Count] = Field(description="false alarms by vehicle/pair, for pairs that have any")
 
@@ -149,16 +149,16 @@ Connectivity = Literal["live", "parked", "silent"]
 
 
 class PairNow(Part):
-    """A pair of a vehicle. Nothing in it is newer than its last word; ages are counted up to now."""
+    """A pair of a vehicle. Nothing in it is newer than its latest heartbeat; ages are counted up to now."""
 
     word: LastWord
     standing: Connectivity = Field(
-        description="`live`: its last word is current; `parked`: it said goodbye; `silent`: it is overdue, or its "
-        "vehicle left without a goodbye, and the state shown is the last known one"
+        description="`live`: its heartbeat is current; `parked`: its service announced the end; `silent`: its "
+        "heartbeat is overdue, or its vehicle left without an announcement, and the state shown is the last known one"
     )
-    said_s: float = Field(ge=0, description="age of its last word, s")
+    said_s: float = Field(ge=0, description="age of its latest heartbeat, s")
     looked_s: float | None = Field(description="age of its last evaluated data, s; null before the first")
-    worst: Literal["rx", "ry", "rz", "tx", "ty", "tz"] | None = Field(description="axis that drifted furthest")
+    worst: Literal["rx", "ry", "rz", "tx", "ty", "tz"] | None = Field(description="axis with the largest drift")
     urgency: float = Field(ge=0, description="drift of that axis, in steps that a monitor has to detect")
 
 
@@ -166,8 +166,8 @@ class FleetNow(Message):
     """Pairs of many vehicles, the most urgent first."""
 
     vehicles: Count
-    known: Count = Field(description="pairs with a last word")
+    known: Count = Field(description="pairs with a heartbeat")
     states: Counts = Field(description="live pairs by state; the others as `parked` and `silent`")
-    matching: Count = Field(description="pairs that the filter lets through")
+    matching: Count = Field(description="pairs that the filter accepts")
     pairs: tuple[PairNow, ...] = Field(description="the first of the matching pairs")
-    refused: Counts = Field(description="last words that were refused, by cause")
+    refused: Counts = Field(description="heartbeats that were refused, by cause")

@@ -82,7 +82,7 @@ class AxisReply(Part):
     """One degree of freedom, about or along an axis of the camera."""
 
     status: AxisStatus = Field(
-        description="`not_solved`: not searched; `not_observable`: searched, but the window does not tell it"
+        description="`not_solved`: not searched; `not_observable`: searched, but the window does not determine it"
     )
     sigma: float | None = Field(description="standard deviation in `unit`; null if not estimated")
     correction: float = Field(description="correction from the nominal calibration, in `unit`")
@@ -113,15 +113,13 @@ class Verdict(Part):
 class MovedWithin(Part):
     """How and when the camera moved while the window was recorded."""
 
-    last_before_ns: int = Field(
-        description="stamp of the last pair surely from before the move, of the window or recorded between, ns"
-    )
-    first_after_ns: int = Field(description="stamp of the first pair surely from after the move, ns")
+    last_before_ns: int = Field(description="stamp of the last pair that is certainly from before the move, ns")
+    first_after_ns: int = Field(description="stamp of the first pair that is certainly from after the move, ns")
     pairs_after: Count = Field(description="pairs of the window after the move; they are kept for the next window")
     before: Transform = Field(
-        description="camera_from_lidar that fits the pairs before the move; found by a turn, not a shift"
+        description="camera_from_lidar that fits the pairs before the move; a rotation is estimated, no translation"
     )
-    after: Transform = Field(description="camera_from_lidar that fits the pairs after the move, found likewise")
+    after: Transform = Field(description="camera_from_lidar that fits the pairs after the move, estimated likewise")
 
 
 class CalibrationResult(Message):
@@ -152,11 +150,11 @@ class CalibrationResult(Message):
         description="correlation of the errors of ry and tx; null if either is unknown"
     )
     independent_looks: float | None = Field(
-        description="how many independent looks the pairs are worth: near 1 if the vehicle stood; null: unknown"
+        description="how many independent samples the pairs are worth: near 1 if the vehicle stood; null: unknown"
     )
-    solved: Flags6 = Field(description="axes that the search found")
+    solved: Flags6 = Field(description="axes that the search estimated")
     unobservable: Flags6 = Field(
-        description="axes that were searched although the window does not determine them: kept as before"
+        description="axes that were searched although the window does not determine them: left as before"
     )
     status: Status
     verdict: Verdict
@@ -231,7 +229,7 @@ class ExtrinsicReply(Message):
     )
     provenance: Provenance = Field(description="where `camera_from_lidar` comes from")
     status: Status = Field(description="status of the latest attempt; not_accepted before the first")
-    percent_complete: float = Field(ge=0, le=100, description="how full the open window is")
+    percent_complete: float = Field(ge=0, le=100, description="fill of the open window, %")
     axes: Axes
     correlation_pitch_height: float | None = Field(
         default=None, description="correlation of the errors of rx and ty; null if either is unknown"
@@ -265,24 +263,24 @@ class DataQuality(Part):
 
 
 class CheckReply(Part):
-    """One check of the monitor at the extrinsic served then, and what all checks so far add up to."""
+    """One check of the monitor at the extrinsic served then, and the result of all checks so far."""
 
     stamp_ns: int = Field(description="stamp of the last pair, ns")
     pair_stamps_ns: tuple[int, ...] = Field(description="stamps of all pairs of the check, ns, ascending")
     flagged: bool = Field(description="the pose is wrong, or the data are")
-    undecided: bool = Field(default=False, description="the check neither accuses nor acquits the pose")
-    weak: bool = Field(description="the edges are fainter than they should be, so that the check counts less")
+    undecided: bool = Field(default=False, description="the check neither rejects nor confirms the pose")
+    weak: bool = Field(description="the edges are faint, so the check counts less")
     flagged_by_paper: bool | None = Field(
         description="verdict of equation (2), for comparison only; null until the rig is commissioned"
     )
     causes: tuple[Reason, ...] = Field(
-        description="what is wrong with the data; a check with a cause says nothing about the pose"
+        description="what is wrong with the data; a check with a cause is no evidence on the pose"
     )
     metrics: dict[Text, MetricReply] = Field(description="figures of the check by name")
     first_derivative: Maybe6 = Field(description="f' at the pose: dMI, nats per rad or m")
     second_derivative: Maybe6 = Field(description="f'' at the pose: -d²MI, nats per rad² or m²")
     offset: Maybe6 = Field(
-        description="from the pose to where the check puts the mount, known bias removed (deg, m): rotations from the "
+        description="from the pose to the estimate of the check, known bias removed (deg, m): rotations from the "
         "optimum over rotations only, translations from the optimum over all axes"
     )
     sigma: Maybe6 = Field(description="standard deviations of `offset` (deg, m)")
@@ -291,24 +289,24 @@ class CheckReply(Part):
     )
     drift_sigma: Maybe6 | None = Field(description="standard deviations of `drift` (deg, m)")
     outcome: Literal["unknown", "clear", "at_odds", "suspect", "confirmed"] = Field(
-        description="finding of all checks so far"
+        description="result of all checks so far"
     )
     evidence: float = Field(description="evidence of all checks so far for a moved mount: log-likelihood ratio, nats")
     state: HealthState = Field(description="state of the pair after the check")
 
 
 class Alarms(Part):
-    """What became of the alarms of a pair since its state directory was new. The rate of false alarms is `withdrawn`
+    """Outcomes of the alarms of a pair since its state directory was new. The rate of false alarms is `withdrawn`
     over `watched_s`."""
 
     watched_s: float = Field(ge=0, description="sensor time between completed checks, s")
     confirmed: Count = Field(description="alarms that ended with another extrinsic")
-    withdrawn: Count = Field(description="alarms that ended `healthy` with the extrinsic that they had accused")
+    withdrawn: Count = Field(description="alarms that ended `healthy` with the extrinsic that they had rejected")
     open: bool = Field(description="whether an alarm has not ended yet")
 
 
 class HealthReply(Message):
-    """Whether the calibration is right. `unknown` means that nothing has looked yet."""
+    """Whether the calibration is correct. `unknown` means that no check has been made yet."""
 
     vehicle: Text
     pair: Text
@@ -328,12 +326,12 @@ class HealthReply(Message):
     check: CheckReply | None = Field(
         default=None, description="the latest check; null if none was made at the served extrinsic"
     )
-    needs: tuple[Text, ...] = Field(description="what is still missing, one sentence each")
+    needs: tuple[Text, ...] = Field(description="what is missing, one sentence each")
     data_quality: DataQuality
     since_ns: int = Field(description="wall clock when this state began, ns since 1970")
     evaluated_ns: int | None = Field(description="stamp of the last evaluated pair, ns; null before the first window")
     age_s: float | None = Field(description="age of the last evaluated window; null before the first")
-    alarms: Alarms | None = Field(default=None, description="counts of its alarms; null while the pair is awaited")
+    alarms: Alarms | None = Field(default=None, description="its alarms by outcome; null while the pair is incomplete")
 
 
 Book = Literal["results", "states", "commands"]
@@ -375,12 +373,12 @@ class HistoryReply(Message):
 
     vehicle: Text
     pair: Text
-    total: Count = Field(description="results kept, before the selector is applied")
+    total: Count = Field(description="results stored, before the selector is applied")
     results: tuple[CalibrationResult, ...]
     entries: tuple[ChainedEntry, ...] = Field(
         default=(), description="entries of all books; results stand here without their bodies"
     )
-    checks: tuple[CheckReply, ...] = Field(default=(), description="checks of the monitor that are kept")
+    checks: tuple[CheckReply, ...] = Field(default=(), description="stored checks of the monitor")
 
 
 class MetricsPoint(Part):
@@ -392,7 +390,7 @@ class MetricsPoint(Part):
 
 
 class EvidenceEvent(Message):
-    """What is kept of a red event: windows before and after, pictures, figures around it, and how it ended."""
+    """What is stored of an incident: windows before and after, pictures, figures around it, and how it ended."""
 
     event_id: Text
     vehicle: Text
@@ -403,14 +401,14 @@ class EvidenceEvent(Message):
     camera_from_lidar: Transform = Field(description="what was served then")
     window_before: Text | None = Field(description="the last window before the event; null if there is none")
     window_after: Text | None = Field(default=None, description="the first window after it; null until there is one")
-    overlays: tuple[Literal["before", "after"], ...] = Field(default=(), description="the kept pictures")
+    overlays: tuple[Literal["before", "after"], ...] = Field(default=(), description="the stored pictures")
     metrics: tuple[MetricsPoint, ...] = Field(description="figures around the event, oldest first")
     resolved_stamp_ns: int | None = Field(default=None, description="sensor time at which the red state ended, ns")
     resolution: Text | None = Field(default=None, description="how it ended, one sentence; null while it is red")
 
 
 class EvidenceReply(Message):
-    """The kept red events, oldest first, without their figures."""
+    """The stored incidents, oldest first, without their figures."""
 
     vehicle: Text
     pair: Text
@@ -431,7 +429,7 @@ class WindowInfo(Part):
     pairs: Count | None = Field(description="null until the file was read, or if it cannot be read")
     decision: Decision | None = Field(description="null while it is not evaluated, or `sha256` is null")
     kept_for: RetentionReason | None = Field(
-        default=None, description="why it is kept longer than others when room is made; null: it is removed in turn"
+        default=None, description="why it is removed after others when space is freed; null: it is removed in turn"
     )
 
 
@@ -473,19 +471,19 @@ class PairStatus(Part):
     lidar: StreamStatus = StreamStatus()
     ego: StreamStatus | None = Field(default=None, description="null if no ego-motion is configured")
     pairs: Count = Field(default=0, description="pairs formed")
-    held: Count = Field(default=0, description="pairs that wait for the judgement of earlier frames")
-    unanswered: Count = Field(default=0, description="checks and windows whose answer has not come")
-    selected: Count = Field(default=0, description="pairs chosen for the open window")
-    unwritten: Count = Field(default=0, description="chosen pairs that wait for the disk")
-    rejections: Counts = Field(default_factory=dict, description="pairs not chosen, by cause")
-    losses: Counts = Field(default_factory=dict, description="frames that found no partner, and windows lost, by cause")
+    held: Count = Field(default=0, description="pairs that wait for the evaluation of earlier frames")
+    unanswered: Count = Field(default=0, description="checks and windows without a result yet")
+    selected: Count = Field(default=0, description="pairs selected for the open window")
+    unwritten: Count = Field(default=0, description="selected pairs that wait for the disk")
+    rejections: Counts = Field(default_factory=dict, description="pairs not selected, by cause")
+    losses: Counts = Field(default_factory=dict, description="frames without a partner, and lost windows, by cause")
     windows: Count = Field(default=0, description="windows recorded")
     solved: Count = Field(default=0, description="windows evaluated")
     checks: Count = Field(default=0, description="checks of the monitor at the served extrinsic")
     transitions: Counts = Field(default_factory=dict, description="changes of health, by the new state")
     commands: Counts = Field(default_factory=dict, description="commands, by name and outcome")
     awaits: tuple[Reason, ...] = Field(
-        default=(), description="what the configuration leaves out and the service has not found yet"
+        default=(), description="what the configuration leaves out and the service has not discovered yet"
     )
     found: dict[Text, Text] = Field(
         default_factory=dict,
@@ -496,7 +494,7 @@ class PairStatus(Part):
 class CompilingStatus(Part):
     """The compilation of the worker's kernels, which happens once on a machine."""
 
-    done: Count = Field(description="kernels that are there")
+    done: Count = Field(description="compiled kernels")
     total: Count = Field(description="kernels that the configuration needs")
     elapsed_s: float = Field(ge=0, description="time since the first was begun, s")
 
@@ -512,11 +510,11 @@ class WorkerStatus(Part):
     waiting: Counts = Field(
         default_factory=dict, description="jobs that wait, by kind; `backlog`: windows of an earlier run"
     )
-    job: Text | None = Field(default=None, description="kind of the job that the worker has; null if it has none")
-    job_age_s: float | None = Field(default=None, ge=0, description="how long the worker has had this job, s")
+    job: Text | None = Field(default=None, description="kind of the job that the worker runs; null if none")
+    job_age_s: float | None = Field(default=None, ge=0, description="how long the worker has run this job, s")
     commissioning: dict[Text, Text] = Field(
         default_factory=dict,
-        description="how far the commissioning of each pair is that has one, such as `spread 4 of 10`",
+        description="progress of the commissioning of each pair that has one, such as `spread 4 of 10`",
     )
     outcomes: Counts = Field(
         default_factory=dict, description="ended jobs by outcome: result, failed, superseded, deadline_passed"
@@ -528,19 +526,19 @@ class WorkerStatus(Part):
 
 
 class BudgetShare(Part):
-    """What one pair takes of the budget."""
+    """The share of one pair in the budget."""
 
-    look_s: float | None = Field(ge=0, description="what a check costs, s of processor time; null before the first")
+    look_s: float | None = Field(ge=0, description="cost of a check, s of processor time; null before the first")
     window_s: float | None = Field(
         ge=0,
-        description="what a window costs, with the depth of its images, s of processor time; null before the first",
+        description="cost of a window, with the depth of its images, s of processor time; null before the first",
     )
     unseen_s: float | None = Field(
         ge=0, description="time since the worker last checked the pair, s; null before the first check"
     )
     suspected: bool = Field(description="the pair is suspected: its checks come first and may borrow")
-    waiting: bool = Field(description="a check waits for its turn")
-    active: bool = Field(description="its streams bring frame pairs for checks")
+    waiting: bool = Field(description="a check waits for budget")
+    active: bool = Field(description="its streams provide frame pairs for checks")
 
 
 class BudgetStatus(Part):
@@ -549,13 +547,13 @@ class BudgetStatus(Part):
     cores: float = Field(description="what checks and windows may spend, per second of sensor time")
     spent: float = Field(
         ge=0,
-        description="what the worker spent on everything in the last three minutes, per second of the steady clock",
+        description="what the worker spent on all work in the last three minutes, per second of the monotonic clock",
     )
-    wanted: float = Field(ge=0, description="what all checks and windows of all active pairs would take")
+    wanted: float = Field(ge=0, description="what all checks and windows of all active pairs would need")
     stretched_by: float = Field(
         ge=1, description="factor by which periods of checks and slices of windows are longer than configured"
     )
-    in_store_s: float = Field(description="unspent processor time, s; below 0: borrowed for a suspicion")
+    in_store_s: float = Field(description="processor time in the token bucket, s; below 0: borrowed for a suspicion")
     spent_s: dict[Text, float] = Field(
         description="processor time of the worker since the start by purpose, s: check, solve, prefetch (depth for a "
         "window), start, idle, backlog, overlay, picture, commission"
@@ -572,11 +570,11 @@ class StorageStatus(Part):
 
 
 class ConfigurationStatus(Part):
-    """What became of the configuration file when it was last read: at the start, or on SIGHUP."""
+    """Result of the last reading of the configuration file: at the start, or on SIGHUP."""
 
     read_ns: int = Field(description="wall clock when it was read, ns since 1970")
     reloads: Count = Field(default=0, description="how often it was read again and applied, wholly or in part")
-    taken: tuple[Text, ...] = Field(default=(), description="keys whose new values apply since then")
+    taken: tuple[Text, ...] = Field(default=(), description="keys whose new values are in force since then")
     waiting: tuple[Text, ...] = Field(default=(), description="keys whose new values wait for a restart")
     refused: Text | None = Field(
         default=None, description="why the file on the disk was refused; then the earlier values stay in force"

@@ -30,14 +30,14 @@ class SensorReply(Part):
     name: Text
     kind: SensorKind
     state: SensorState = Field(
-        description="`undecided`: something moved or is disturbed, and it may be this sensor; `unknown`: no look yet. "
+        description="`undecided`: something moved or is disturbed, and it may be this sensor; `unknown`: no check yet. "
         "`camera_moved` and `lidar_moved` last until every pair of the sensor serves another extrinsic"
     )
-    probability: Probability | None = Field(description="probability that the sensor moved; null if nothing can tell")
-    since_ns: int | None = Field(description="sensor time at which this state began, ns; null before any look")
+    probability: Probability | None = Field(description="probability that the sensor moved; null if not measured")
+    since_ns: int | None = Field(description="sensor time at which this state began, ns; null before any check")
     moved: SensorMove | None = Field(description="set if the sensor moved, or may have")
     pairs: tuple[Text, ...] = Field(description="pairs of this sensor")
-    reasons: tuple[Reason, ...] = Field(description="why the sensor is in this state; the first one says most")
+    reasons: tuple[Reason, ...] = Field(description="why the sensor is in this state, the most important first")
 
 
 class JointPair(Part):
@@ -61,13 +61,13 @@ class OpenLoop(Part):
     names: tuple[Text, ...] = Field(description="pairs and links of the loop, in order")
     rotation_deg: float = Field(description="rotation by which it does not close")
     translation_m: float | None = Field(
-        description="translation by which it does not close; null if a pair in it does not tell"
+        description="translation by which it does not close; null if a pair in it does not determine it"
     )
     p_value: Probability = Field(description="chance of a gap at least as large")
 
 
 class JointReply(Part):
-    """Where all sensors are, from the latest windows of all pairs."""
+    """Poses of all sensors, estimated from the latest windows of all pairs."""
 
     stamp_ns: int = Field(description="stamp of the newest window in it, ns")
     pairs: tuple[JointPair, ...]
@@ -81,39 +81,39 @@ class JointReply(Part):
 
 
 class RigMove(Part):
-    """A move of one or two sensors. It lasts from their naming until every pair of them serves another extrinsic."""
+    """A move of one or two sensors. It lasts from its attribution until every pair of them serves another extrinsic."""
 
     sensors: tuple[Text, ...]
-    since_ns: int = Field(description="sensor time at which they were named, ns")
+    since_ns: int = Field(description="sensor time of the attribution, ns")
     stepped_ns: int = Field(description="sensor time before which they moved, ns")
     over_ns: int | None = Field(description="sensor time at which the move was corrected, ns; null until then")
-    by: dict[Text, SensorMove] = Field(description="size of the move by sensor, as known when they were named")
+    by: dict[Text, SensorMove] = Field(description="size of the move by sensor, as known at the attribution")
 
 
 class LidarsReply(Part):
-    """Two LiDARs of the vehicle, compared by the surfaces that both see, without any camera."""
+    """Two LiDARs of the vehicle, registered by the surfaces that both measure, without any camera."""
 
     name: Text = Field(description="name of the edge, as in `disturbed` and `looks`")
     a: Text
     b: Text
     state: LidarsState = Field(
-        description="`measured`: the latest look tells the pose of b in a; `refused`: it does not, or no look came of "
-        "the latest sweep; `waiting`: no look yet; `not_measured`: not looked at"
+        description="`measured`: the latest registration determines the pose of b in a; `refused`: it does not, or the "
+        "latest sweep gave none; `waiting`: no registration yet; `not_measured`: not registered"
     )
     reasons: tuple[Reason, ...] = Field(description="reasons for the state; empty if it is `measured`")
     stamp_ns: int | None = Field(
-        description="stamp of the latest look, or of the sweep that gave no look, ns; null: no sweep came"
+        description="stamp of the latest registration, or of the sweep that gave none, ns; null: no sweep yet"
     )
-    measured_ns: int | None = Field(description="stamp of the latest useful look, from which the figures below are, ns")
-    a_from_b: Transform | None = Field(description="maps coordinates of b to those of a; null before any look")
+    measured_ns: int | None = Field(description="stamp of the registration that gave the figures below, ns")
+    a_from_b: Transform | None = Field(description="maps coordinates of b to those of a; null before the first")
     sigma: Vector6 | None = Field(description="standard deviations about and along the axes of a (deg, m)")
     correction: Vector6 | None = Field(description="from the nominal pose to this one: rx ry rz (deg), tx ty tz (m)")
     range_bias_m: float | None = Field(description="by how much b measures longer ranges than a, m")
     range_bias_sigma_m: float | None
     rms_m: float | None = Field(description="rms distance of the points of b from the surfaces of a, m")
     share: Probability | None = Field(description="share of the points of b that lie on a surface of a")
-    looks: Count = Field(description="useful looks")
-    losses: Counts = Field(description="looks and sweeps that were lost, by cause")
+    looks: Count = Field(description="useful registrations")
+    losses: Counts = Field(description="registrations and sweeps that were lost, by cause")
 
 
 class RigCorrection(Part):
@@ -126,16 +126,16 @@ class RigCorrection(Part):
 
 
 class RigReply(Message):
-    """All sensors of a vehicle. Before the first look all of them are `unknown`."""
+    """All sensors of a vehicle. Before the first check all of them are `unknown`."""
 
     vehicle: Text
     stamp_ns: int | None = Field(
-        description="sensor time up to which everything that was asked for is included, ns; null: nothing yet"
+        description="sensor time up to which all requested results are included, ns; null: nothing yet"
     )
     sensors: tuple[SensorReply, ...]
-    nobody: Probability | None = Field(description="probability that no sensor moved; null before the first look")
+    nobody: Probability | None = Field(description="probability that no sensor moved; null before the first check")
     disturbed: dict[Text, Probability] = Field(
-        description="by pair, or by edge between two LiDARs: probability that something else disturbs it lastingly"
+        description="by pair, or by edge between two LiDARs: probability that something else disturbs it permanently"
     )
     joint: JointReply | None = Field(description="null before the first accepted window, and for a single pair")
     correction: RigCorrection | None = Field(description="the latest correction; null before the first")
@@ -144,5 +144,5 @@ class RigReply(Message):
     )
     lidars: tuple[LidarsReply, ...] = Field(default=(), description="every two LiDARs")
     reasons: tuple[Reason, ...] = Field(default=(), description="what prevents combining the pairs")
-    looks: Counts = Field(description="combined checks by pair, and looks at two LiDARs by edge")
-    losses: Counts = Field(description="looks that were not combined, or came out of order, by cause")
+    looks: Counts = Field(description="combined checks by pair, and registrations of two LiDARs by edge")
+    losses: Counts = Field(description="checks that were not combined, or arrived out of order, by cause")

@@ -212,7 +212,7 @@ def test_what_sees_nothing_in_common_is_refused_as_text() -> None:
     far = [SweepPair(p.a, LidarFrame(0, "b", p.b.xyz_m + np.float32(100.0)), None) for p in drive(room, 8, pairs=1)]
     detected = edge(far, np.zeros(6))
     assert [reason.code for reason in detected.reasons] == ["lidar_overlap"]
-    assert "too little in view in common" in detected.reasons[0].text
+    assert "overlap too little" in detected.reasons[0].text
     assert detected.sigma[0] > np.deg2rad(5.0)
     with pytest.raises(ValueError, match="no sweep"):
         edge([], np.zeros(6))

@@ -147,7 +147,7 @@ def test_a_sensor_is_ok_only_where_it_was_checked_and_fits(state: SensorState) -
 
 def test_a_sensor_that_moved_says_by_how_much_and_in_which_pairs() -> None:
     reported = status_of_sensor(moved_lidar_sensor(), "shuttle-7", "running")
-    assert reported.message == "lidar_moved: It moved by 1.00°: seen by front, left; all else fits (99.8 %)."
+    assert reported.message == "lidar_moved: It moved by 1.00°: measured by front, left; all else fits (99.8 %)."
     assert reported.values["pairs"] == "front, left"
     assert reported.values["probability of a move"] == "0.998"
     assert reported.values["moved"].startswith("rx 0 ± 0.05 deg, ry 1 ± 0.05 deg")

@@ -57,7 +57,7 @@ def test_checks_that_do_not_acquit_renew_nothing() -> None:
         progress.completed(round((900.0 + second) * S), second, ALL, acquits=False)
     assert progress.overdue(ALL, 115.0, at_rest=False) is None
     late = progress.overdue(ALL, 115.1, at_rest=False)
-    assert late == Reason("not_acquitted", "Checks are completed, but none has acquitted the extrinsic for 15 s.")
+    assert late == Reason("not_acquitted", "Checks are completed, but none has confirmed the extrinsic for 15 s.")
     assert progress.overdue(ALL, 115.1, at_rest=True) is None, "the acquitting check of this place still counts"
     stopped = progress.overdue(ALL, 129.1, at_rest=True)
     assert stopped is not None
@@ -129,7 +129,7 @@ def test_three_attempts_in_a_row_that_come_to_nothing_are_a_problem_and_one_that
         attempts.failed(Reason("range_edges", text))
     assert attempts.problem is None
     attempts.failed(Reason("overlap", "Too little in view."))
-    assert attempts.problem == Reason("windows_in_vain", "The last 3 windows came to nothing. Too little in view.")
+    assert attempts.problem == Reason("windows_in_vain", "The last 3 windows gave no result. Too little in view.")
     attempts.succeeded()
     assert attempts.problem is None
     attempts.failed(Reason("overlap", "Too little in view."))

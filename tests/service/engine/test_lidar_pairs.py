@@ -134,7 +134,7 @@ def test_a_worker_that_fails_is_a_reason_and_no_end(tmp_path: Path) -> None:
 
 @pytest.mark.fault("two LiDARs see nothing in common", "this is reported, and tried an eighth as often")
 def test_lidars_that_do_not_overlap_are_let_rest(tmp_path: Path) -> None:
-    separation = Reason("lidar_overlap", "roof and bumper have too little in view in common.")
+    separation = Reason("lidar_overlap", "roof and bumper overlap too little.")
 
     def answers(rig: LidarRig, stamp_ns: int) -> Answer:
         del stamp_ns

@@ -89,13 +89,13 @@ class Cause:
 
 BENT_MOUNT = Cause(
     "bent_mount",
-    "The camera and the LiDAR have moved against each other.",
-    "See that the mount is tight; the next accepted window corrects the extrinsic, or `coec calibrate` does.",
+    "The camera has moved relative to the LiDAR.",
+    "Check that the mount is tight; the next accepted window corrects the extrinsic, or `coec calibrate` does.",
 )
 MOUNT_LOOSE = Cause(
     "mount_loose",
-    "The pose of the camera relative to the LiDAR changes from one check to the next by more than checks scatter.",
-    "Tighten the mount: no single extrinsic is right while it swings.",
+    "The pose of the camera relative to the LiDAR changes from check to check by more than their uncertainty.",
+    "Tighten the mount: no single extrinsic is correct while it moves.",
 )
 LENS_DIRTY = Cause(
     "lens_dirty",
@@ -104,12 +104,12 @@ LENS_DIRTY = Cause(
 )
 LENS_COVERED = Cause(
     "lens_covered",
-    "Most of the image shows nothing.",
+    "Most of the image has no contrast.",
     "Uncover the lens.",
 )
 CAMERA_FROZEN = Cause(
     "camera_frozen",
-    "The camera repeats the same picture while the vehicle drives.",
+    "The camera repeats the same image while the vehicle drives.",
     "Restart the camera or its driver.",
 )
 LIDAR_FROZEN = Cause(
@@ -119,33 +119,33 @@ LIDAR_FROZEN = Cause(
 )
 BEAMS_LOST = Cause(
     "lidar_beams_lost",
-    "Some directions of the LiDAR return far fewer points than when commissioned.",
-    "Clean the LiDAR, and look for what stands in front of it.",
+    "Some beams or sectors of the LiDAR return far fewer points than when the rig was commissioned.",
+    "Clean the LiDAR, and remove what blocks its view.",
 )
 EGO_MOTION_WRONG = Cause(
     "ego_motion_wrong",
-    "The sweeps fit the images better with another ego-motion.",
+    "The sweeps fit the images better with a different ego-motion.",
     "Check the scale, sign and frame of the ego-motion (`ego.T_lidar_ego`).",
 )
 TIME_OFFSET = Cause(
     "time_offset",
-    "The sweeps fit the images better with another time between the sensors.",
-    "Check the clocks of camera and LiDAR; `coec calibrate --time-offset` measures the camera's.",
+    "The sweeps fit the images better with a different time offset between the sensors.",
+    "Check the clocks of camera and LiDAR; `coec calibrate --time-offset` measures the offset.",
 )
 INTRINSICS_WRONG = Cause(
     INTRINSICS_OFF,
-    "A window fits another lens better than the intrinsics of the rig.",
-    "Calibrate the intrinsics anew: no extrinsic makes up for wrong ones.",
+    "Other intrinsics explain a window better than those of the rig.",
+    "Calibrate the intrinsics again: no extrinsic compensates wrong ones.",
 )
 DARK = Cause(
     "dark",
-    "It is too dark for the camera.",
-    "Wait for light.",
+    "The images are too dark.",
+    "Wait for more light.",
 )
 OPEN_FIELD = Cause(
     "open_field",
-    "There is too little structure in reach of the LiDAR.",
-    "Wait for buildings, poles or cars in reach.",
+    "There is too little structure within range of the LiDAR.",
+    "Wait for buildings, poles or cars within range.",
 )
 
 CAUSES = {

@@ -321,10 +321,10 @@ def _state(state: RigState, graph: RigGraph, sensor: Sensor) -> SensorState:
     observed = [name for name in edges if state.histories[name].observations]
     of = state.posterior
     if of is None and sensor.name in state.named:
-        text = "It had moved when the service was stopped; none of its pairs has been looked at since."
+        text = "It had moved when the service was stopped; none of its pairs has been checked since."
         return SensorState(sensor.name, sensor.kind, _moved(sensor), 1.0, None, (Reason("last_known", text),))
     if of is None or not observed:
-        text = "None of its pairs has been looked at yet." if edges else "It is in no pair: nothing shows where it is."
+        text = "None of its pairs has been checked yet." if edges else "It is in no pair, so its pose is not measured."
         return SensorState(sensor.name, sensor.kind, SensorHealth.UNKNOWN, 0.0, None, (Reason("not_looked_at", text),))
     probability = of.sensors[sensor.name]
     disturbed = max((of.disturbed[name] for name in edges), default=0.0)
@@ -338,13 +338,13 @@ def _state(state: RigState, graph: RigGraph, sensor: Sensor) -> SensorState:
             decides = (
                 "a window of its pairs decides"
                 if _is_hidden(sensor.name, _probable(of), graph)
-                else "the next looks decide"
+                else "the next checks decide"
             )
-            text = f"It seems to have moved ({100.0 * probability:.1f} %); {decides}."
+            text = f"It has probably moved ({100.0 * probability:.1f} %); {decides}."
             reasons = (Reason("one_more_look", text), *reasons[1:])
     else:
         health = SensorHealth.CALIBRATED
-        text = f"The pairs that were looked at fit without a move of it: {', '.join(observed)}."
+        text = f"The checked pairs fit without a move of this sensor: {', '.join(observed)}."
         reasons = (Reason("fits", text),)
     return SensorState(sensor.name, sensor.kind, health, probability, moved, reasons)
 
@@ -358,7 +358,7 @@ def _named(sensor: Sensor, probability: float, moved: Moved | None, observed: li
     far = "" if moved is None else f" by {_size(moved)}"
     others = [name for name in of.sets[0][0] if name != sensor.name]
     others_text = f", together with {', '.join(others)}" if others else ""
-    text = f"It moved{far}{others_text}: seen by {', '.join(since)}; all else fits ({100.0 * probability:.1f} %)."
+    text = f"It moved{far}{others_text}: measured by {', '.join(since)}; all else fits ({100.0 * probability:.1f} %)."
     return Reason("moved", text)
 
 
@@ -369,11 +369,11 @@ def _undecided(
     if probability > 1.0 - NAMED_AT:
         rivals = [" and ".join(names) for names, _ in of.sets if sensor.name not in names][:3]
         or_else = f" or {', or '.join(rivals)}" if rivals else ", or nothing did"
-        text = f"It moved{or_else}: the pairs that were looked at cannot tell ({100.0 * probability:.0f} %)."
+        text = f"It moved{or_else}: the checked pairs cannot distinguish ({100.0 * probability:.0f} %)."
         reasons.append(Reason("cannot_tell", text))
     if disturbed > 1.0 - NAMED_AT:
         pair = max(edges, key=lambda name: of.disturbed[name])
-        text = f"{pair} is off, and other pairs deny that a sensor moved: {100.0 * disturbed:.0f} %."
+        text = f"{pair} does not fit, and other pairs exclude a move of a sensor: {100.0 * disturbed:.0f} %."
         reasons.append(Reason("pair_disturbed", text))
     return tuple(reasons)
 

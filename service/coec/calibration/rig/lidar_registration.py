@@ -258,8 +258,8 @@ def _reasons(rig: lidar_sampling.LidarRig, points: int, share: float) -> tuple[R
     return (
         Reason(
             "lidar_overlap",
-            f"{rig.a} and {rig.b} have too little in view in common: {points} points of {rig.b} lie on surfaces of "
-            f"{rig.a}, {100.0 * share:.1f} %; {LEAST_POINTS} and {100.0 * lidar_sampling.LEAST_SHARE:g} % are needed.",
+            f"{rig.a} and {rig.b} overlap too little: {points} points of {rig.b} lie on surfaces of {rig.a}, "
+            f"{100.0 * share:.1f} %; {LEAST_POINTS} and {100.0 * lidar_sampling.LEAST_SHARE:g} % are needed.",
         ),
     )
 

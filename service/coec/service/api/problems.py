@@ -284,10 +284,10 @@ def stream_problems(streams: Mapping[str, StreamCounts], pair: PairConfig, topic
             text = f"{several} send on {stream.place} at the same time{who}."
             reasons.append(Reason("two_senders", f"{text} Their frames are refused until only one sends."))
         if counts.foreign:
-            text = f"On {stream.place} come frames with another frame id or image size beside those of the sensor"
+            text = f"Frames with another frame id or image size arrive on {stream.place} beside those of the sensor"
             reasons.append(Reason("foreign_frames", f"{text}; they are refused."))
         if counts.stamped_by_sender:
-            text = f"Messages on {stream.place} have no stamp: each has the stamp from the sender's clock."
+            text = f"Messages on {stream.place} have no stamp: the clock of the sender stamps them."
             reasons.append(Reason("sender_clock", text))
     return tuple(reasons)
 
@@ -322,15 +322,15 @@ def _reason(rig: VehicleRig, pair: str, objection: RigAlarm) -> Reason:
     edge = rig.graph.edge[pair]
     if objection is RigAlarm.MOVED and rig.event is not None:
         moved = " and ".join(name for name in rig.event.sensors if name in (edge.a, edge.b))
-        text = f"{moved} moved, and this pair still serves what was before; a window from after the move puts it right."
+        text = f"{moved} moved, and this pair serves the extrinsic from before; a window after the move corrects it."
         return Reason(MOVED, text)
     if objection is RigAlarm.SUSPECTED:
         undecided = (one.name for one in rig.sensors if one.health is SensorHealth.UNDECIDED)
         may_be = " or ".join(name for name in undecided if name in (edge.a, edge.b))
         return Reason(
-            SUSPECTED, f"{may_be} may have moved: the pairs of the vehicle do not agree; the next looks decide."
+            SUSPECTED, f"{may_be} may have moved: the pairs of the vehicle are inconsistent; the next checks decide."
         )
-    return Reason(INCONSISTENT, f"The pairs of the vehicle do not agree where its sensors are{_misfit(rig.joint)}.")
+    return Reason(INCONSISTENT, f"The pairs of the vehicle are inconsistent{_misfit(rig.joint)}.")
 
 
 def _misfit(joint: JointEstimate | None) -> str:

@@ -583,5 +583,5 @@ def _due_ns(request: PendingRequest | None) -> int | None:
 HELD = "held"
 """Code of the only reason in `troubles` that is no trouble: the extrinsic is on hold."""
 
-_NO_ANSWER = Reason("unanswered", "No answer came.")
-_NOT_RECORDED = Reason("not_recorded", "The window did not get to the disk.")
+_NO_ANSWER = Reason("unanswered", "The worker did not answer.")
+_NOT_RECORDED = Reason("not_recorded", "The window was not written to the disk.")

@@ -64,7 +64,7 @@ class Attempts:
             return
         self._failures += 1
         if self._failures >= REPORTED_FAILURES:
-            text = f"The last {self._failures} {self._what} came to nothing. {reason.text}"
+            text = f"The last {self._failures} {self._what} gave no result. {reason.text}"
             self.problem = Reason(self._code, text)
 
     def succeeded(self) -> None:
@@ -126,7 +126,7 @@ class CheckProgress:
         late_s = None if at_rest else self._late_s(self._acquitted, report, monotonic_s)
         if late_s is None:
             return None
-        return Reason(NOT_ACQUITTED, f"Checks are completed, but none has acquitted the extrinsic for {late_s:.0f} s.")
+        return Reason(NOT_ACQUITTED, f"Checks are completed, but none has confirmed the extrinsic for {late_s:.0f} s.")
 
     def _late_s(self, last: _Last, report: StreamStatistics, monotonic_s: float) -> float | None:
         """Time since `last`, s, if it is longer than allowed."""

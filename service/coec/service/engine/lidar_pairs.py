@@ -46,9 +46,9 @@ NO_EGO = Reason(
     "instant.",
 )
 NOT_JOINED = Reason(
-    "no_nominal_pose", "Not measured: no cameras and links join the two, so nothing tells where they were built."
+    "no_nominal_pose", "Not measured: no cameras and links connect the two, so their nominal relative pose is unknown."
 )
-TOO_MANY = Reason("too_many", f"Not measured: {MAX_LIDAR_PAIRS} pairs of LiDARs are looked at, and this is one more.")
+TOO_MANY = Reason("too_many", f"Not measured: {MAX_LIDAR_PAIRS} pairs of LiDARs are registered, and this is one more.")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,16 +138,14 @@ only an eighth. If they overlap after all, in a narrow street, that is noticed w
 
 WEAK = Reason(
     "surroundings_tell_nothing",
-    "What both see, such as open ground, tells no direction and no place better than it was known before.",
+    "The surfaces that both measure, such as open ground, determine no axis better than it was known before.",
 )
 
 MISSED: Mapping[str, Reason] = {
-    "standing": Reason("vehicle_stands", "The vehicle stands: it sees again what it saw."),
-    "no_sweep": Reason("no_sweep", "There is no sweep of the one near in time to a sweep of the other."),
-    "no_ego_motion": Reason("no_ego_motion", "There is no ego-motion with a velocity at the time of the sweeps."),
-    "no_point_time": Reason(
-        "no_point_time", "Points are not timed, and the vehicle moves: `lidar.sweep` says how they are measured."
-    ),
+    "standing": Reason("vehicle_stands", "The vehicle stands, so its sweeps repeat."),
+    "no_sweep": Reason("no_sweep", "No sweep of one LiDAR is near in time to a sweep of the other."),
+    "no_ego_motion": Reason("no_ego_motion", "No ego-motion with a velocity covers the time of the sweeps."),
+    "no_point_time": Reason("no_point_time", "Points have no time, and the vehicle moves: set `lidar.sweep`."),
 }
 
 

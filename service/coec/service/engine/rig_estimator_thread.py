@@ -314,7 +314,9 @@ MOST_CORRECTIONS = 4
 SAVE_NS = 60 * NS_PER_S
 """Sensor time between two savings while nothing happens. If the process is killed, a minute of looks is lost."""
 
-ONE_PAIR = Reason("one_pair", "One pair cannot tell its camera from its LiDAR: its `health` says whether either moved.")
+ONE_PAIR = Reason(
+    "one_pair", "One pair cannot distinguish a move of its camera from one of its LiDAR; see its `health`."
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -566,7 +568,7 @@ class RigEstimatorThread:
             configured = {name: (joined.config, joined.nominal) for name, joined in self._pairs.items()}
             self._graph = graph_of(configured, self._links, measured)
         except ValueError as error:
-            self._rig, self._why = None, (Reason("no_rig", f"The pairs are not put together: {error}."),)
+            self._rig, self._why = None, (Reason("no_rig", f"The pairs cannot be combined: {error}."),)
             return
         if len(self._pairs) < 2:
             self._why = (ONE_PAIR,)

@@ -42,8 +42,8 @@ WINDOW_WAITS_S = 5.0
 """How long checks may keep a window of this run from the worker, s: the usual time between two checks of a pair. While
 a window waits, its pair is not looked at."""
 
-SUPERSEDED = Reason("superseded", "A newer one of the pair came before the worker was free.")
-BUSY = Reason("busy", "Too much waits for the worker; ask again in a moment.")
+SUPERSEDED = Reason("superseded", "A newer job of the pair arrived before the worker was free.")
+BUSY = Reason("busy", "Too many jobs wait for the worker; ask again in a moment.")
 STOPPING = Reason("stopping", "The service is stopping.")
 
 WORKER_FAILED = "worker_failed"
