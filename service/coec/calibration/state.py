@@ -585,7 +585,7 @@ def rolled_back(state: PairState, pose: Matrix4, estimate: Estimate, rules: Pair
         CommandRefusedError: the extrinsic is held.
     """
     _refuse_if_held(state)
-    state = _replaced(state, pose, "Rolled back by command; not looked at since.")
+    state = _replaced(state, pose, "Rolled back by command; not checked since.")
     return replace(
         state,
         provenance=Provenance.RESTORED,
@@ -603,7 +603,7 @@ def reset(state: PairState, rig: Rig) -> PairState:
         CommandRefusedError: the extrinsic is held.
     """
     _refuse_if_held(state)
-    state = _replaced(state, rig.T_camera_lidar_nominal, "Reset to nominal by command; not looked at since.")
+    state = _replaced(state, rig.T_camera_lidar_nominal, "Reset to nominal by command; not checked since.")
     return replace(state, provenance=Provenance.NOMINAL, valid_from_ns=0, accepted=None, proven=False, track=None)
 
 

@@ -143,7 +143,7 @@ def discover(
     try:
         return DiscoveredPair(PairConfig.model_validate(document), search.origins)
     except ValidationError as error:
-        return (Reason(CANNOT_BE_BUILT, f"What was found cannot be used: {describe(error)}."),)
+        return (Reason(CANNOT_BE_BUILT, f"The discovered calibration cannot be used: {describe(error)}."),)
 
 
 class _MissingError(Exception):

@@ -69,11 +69,11 @@ class NominalStatus:
 
 
 NOTHING_RECEIVED = NominalStatus(
-    awaits=(Reason("no_look_yet", "Nobody has looked yet for what the configuration leaves out."),)
+    awaits=(Reason("no_look_yet", "The discovery of what the configuration leaves out has not begun yet."),)
 )
 
 
-BEING_BUILT = Reason("being_built", "Everything that the configuration leaves out is found; the pair is being built.")
+BEING_BUILT = Reason("being_built", "Everything that the configuration leaves out is known; the pair is being built.")
 
 
 @dataclass(slots=True)

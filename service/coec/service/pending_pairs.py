@@ -157,7 +157,9 @@ class PendingPairs:
     def refuse(self, name: str, why: str) -> None:
         """What was found for a pair cannot be used. The pair is awaited again until something else is heard."""
         _log.error(f"the discovered calibration of a pair cannot be used: {why}", extra={"fields": {"pair": name}})
-        self._listener.end(name, Reason(discovery.CANNOT_BE_BUILT, f"What was found cannot be used: {why}."))
+        self._listener.end(
+            name, Reason(discovery.CANNOT_BE_BUILT, f"The discovered calibration cannot be used: {why}.")
+        )
 
     def renew(self) -> None:
         """Renews the answers; called once a second."""
