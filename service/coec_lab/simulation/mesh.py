@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -53,9 +54,13 @@ class Mesh:
     def placed(self, x_m: float, y_m: float, z_m: float, heading_rad: float) -> Mesh:
         """The mesh turned about the vertical, then moved."""
         cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
-        x, y, z = np.moveaxis(self.corners_m.astype(np.float64), -1, 0)
-        moved = np.stack([cosine * x - sine * y + x_m, sine * x + cosine * y + y_m, z + z_m], axis=-1)
-        return Mesh(moved.astype(np.float32), self.colour, self.material)
+        corners = self.corners_m.astype(np.float64)
+        x, y, z = corners[..., 0], corners[..., 1], corners[..., 2]
+        moved = np.empty_like(self.corners_m)
+        moved[..., 0] = cosine * x - sine * y + x_m
+        moved[..., 1] = sine * x + cosine * y + y_m
+        moved[..., 2] = z + z_m
+        return Mesh(moved, self.colour, self.material)
 
 
 def join(meshes: Sequence[Mesh]) -> Mesh:
@@ -70,15 +75,40 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
 def triangles(corners_m: ArrayLike, colour: ArrayLike, material: Material) -> Mesh:
     """A mesh of triangles. corners_m: (T, 3, 3) or one (3, 3); colour: one, or (T, 3)."""
     shape = np.asarray(corners_m, dtype=np.float32).reshape(-1, 3, 3)
-    paint = np.broadcast_to(np.asarray(colour, dtype=np.float32), (len(shape), 3)).copy()
+    paint = np.empty((len(shape), 3), dtype=np.float32)
+    paint[:] = colour
     return Mesh(shape, paint, np.full(len(shape), int(material), dtype=np.int8))
 
 
 def quads(corners_m: ArrayLike, colour: ArrayLike, material: Material) -> Mesh:
     """A mesh of quads. corners_m: (Q, 4, 3) around each, or one (4, 3); colour: one, or (Q, 3)."""
     four = np.asarray(corners_m, dtype=np.float32).reshape(-1, 4, 3)
-    paint = np.broadcast_to(np.asarray(colour, dtype=np.float32), (len(four), 3))
-    return triangles(four[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3), np.repeat(paint, 2, axis=0), material)
+    halves = np.empty((len(four), 2, 3, 3), dtype=np.float32)
+    halves[:, 0] = four[:, :3]
+    halves[:, 1, 0] = four[:, 0]
+    halves[:, 1, 1:] = four[:, 2:]
+    paint = np.empty((len(four), 2, 3), dtype=np.float32)
+    paint[:] = np.asarray(colour)[..., None, :]
+    return triangles(halves, paint.reshape(-1, 3), material)
+
+
+def solid(
+    ring0_m: ArrayLike, ring1_m: ArrayLike, colour: ArrayLike, material: Material, *, open_below: bool = False
+) -> Mesh:
+    """What lies between two convex rings of as many corners, (K, 3) each, with a lid on both or on the second alone."""
+    corners = np.concatenate([ring0_m, ring1_m]).astype(np.float32)
+    return triangles(corners[_faces_of_solid(len(corners) // 2, open_below)], colour, material)
+
+
+@cache
+def _faces_of_solid(corners: int, open_below: bool) -> NDArray[np.intp]:
+    """(T, 3) indices into both rings, one after the other: two triangles for each side, then the lids as fans."""
+    low = np.arange(corners)
+    after = np.roll(low, -1)
+    sides = np.stack([low, after, after + corners, low, after + corners, low + corners], axis=1).reshape(-1, 3)
+    fan = np.arange(1, corners - 1)
+    lid = np.stack([np.zeros_like(fan), fan, fan + 1], axis=1)
+    return np.concatenate([sides, lid + corners] if open_below else [sides, lid, lid + corners])
 
 
 def box(low_m: ArrayLike, high_m: ArrayLike, colour: ArrayLike, material: Material) -> Mesh:
@@ -92,34 +122,39 @@ def prism(
 ) -> Mesh:
     """A convex outline (K, 2) in x, y raised from low to high, with a lid scaled by `taper` about its centre."""
     base = np.asarray(outline_m, dtype=float)
-    top = base.mean(axis=0) + taper * (base - base.mean(axis=0))
-    ring0 = np.column_stack([base, np.full(len(base), low_m)])
-    ring1 = np.column_stack([top, np.full(len(base), high_m)])
-    sides = np.stack([ring0, np.roll(ring0, -1, axis=0), np.roll(ring1, -1, axis=0), ring1], axis=1)
-    fan = np.arange(1, len(base) - 1)
-    lid = np.stack([np.broadcast_to(ring1[0], (len(fan), 3)), ring1[fan], ring1[fan + 1]], axis=1)
-    return join([quads(sides, colour, material), triangles(lid, colour, material)])
+    centre = base.mean(axis=0)
+    ring0, ring1 = np.empty((2, len(base), 3))
+    ring0[:, :2], ring0[:, 2] = base, low_m
+    ring1[:, :2], ring1[:, 2] = centre + taper * (base - centre), high_m
+    return solid(ring0, ring1, colour, material, open_below=True)
 
 
 def circle(radius_m: float, sides: int, centre_m: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
     """(sides, 2) outline of a circle."""
+    return np.asarray(centre_m) + radius_m * _unit_circle(sides)
+
+
+@cache
+def _unit_circle(sides: int) -> NDArray[np.float64]:
     angle = 2 * np.pi * np.arange(sides) / sides
-    return np.asarray(centre_m) + radius_m * np.column_stack([np.cos(angle), np.sin(angle)])
+    return np.column_stack([np.cos(angle), np.sin(angle)])
 
 
 def tube(start_m: ArrayLike, end_m: ArrayLike, radius_m: float, sides: int, colour: ArrayLike, kind: Material) -> Mesh:
     """A round bar with lids between two points."""
     start, end = np.asarray(start_m, dtype=float), np.asarray(end_m, dtype=float)
     along = (end - start) / np.linalg.norm(end - start)
-    across = np.cross(along, [0.0, 0.0, 1.0] if abs(along[2]) < 0.9 else [1.0, 0.0, 0.0])
+    across = _cross(along, np.array([0.0, 0.0, 1.0] if abs(along[2]) < 0.9 else [1.0, 0.0, 0.0]))
     across /= np.linalg.norm(across)
     ring = circle(radius_m, sides)
-    offsets = ring[:, :1] * across + ring[:, 1:] * np.cross(along, across)
-    near, far = start + offsets, end + offsets
-    sides_m = np.stack([near, np.roll(near, -1, axis=0), np.roll(far, -1, axis=0), far], axis=1)
-    fan = np.arange(1, sides - 1)
-    lids = [np.stack([np.broadcast_to(e[0], (len(fan), 3)), e[fan], e[fan + 1]], axis=1) for e in (near, far)]
-    return join([quads(sides_m, colour, kind), triangles(np.concatenate(lids), colour, kind)])
+    offsets = ring[:, :1] * across + ring[:, 1:] * _cross(along, across)
+    return solid(start + offsets, end + offsets, colour, kind)
+
+
+def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of two vectors (3,): numpy's takes ten times as long."""
+    (a0, a1, a2), (b0, b1, b2) = a, b
+    return np.array([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0])
 
 
 def ball(centre_m: ArrayLike, radii_m: ArrayLike, colour: ArrayLike, kind: Material, sides: int = 8) -> Mesh:

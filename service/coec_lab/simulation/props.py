@@ -6,7 +6,20 @@ Local frames: x forward (cars) or along the street, y left, z up, origin on the 
 import numpy as np
 from numpy.typing import NDArray
 
-from coec_lab.simulation.mesh import Colour, Material, Mesh, ball, box, circle, join, prism, quads, triangles, tube
+from coec_lab.simulation.mesh import (
+    Colour,
+    Material,
+    Mesh,
+    ball,
+    box,
+    circle,
+    join,
+    prism,
+    quads,
+    solid,
+    triangles,
+    tube,
+)
 
 Doubles = NDArray[np.float64]
 
@@ -77,10 +90,7 @@ def _extruded(xz_m: Doubles, half_m: float, half_top_m: float, colour: Doubles, 
     """A side profile (K, 2), counter-clockwise or clockwise, drawn out to both sides."""
     right = np.column_stack([xz_m[:, 0], np.full(len(xz_m), -half_m), xz_m[:, 1]])
     left = np.column_stack([xz_m[:, 0], np.full(len(xz_m), half_top_m), xz_m[:, 1]])
-    skin = np.stack([right, np.roll(right, -1, axis=0), np.roll(left, -1, axis=0), left], axis=1)
-    fan = np.arange(1, len(xz_m) - 1)
-    sides = [np.stack([np.broadcast_to(s[0], (len(fan), 3)), s[fan], s[fan + 1]], axis=1) for s in (right, left)]
-    return join([quads(skin, colour, kind), triangles(np.concatenate(sides), colour, kind)])
+    return solid(right, left, colour, kind)
 
 
 def _cabin(xz_m: Doubles, low_half_m: float, top_half_m: float, paint: Doubles) -> Mesh:

@@ -180,7 +180,7 @@ def _wall(
 
 def _faces(*corners: tuple[Floating, Floating, Floating]) -> Floating:
     """(N, 4, 3) from the coordinates (N,) of four corners."""
-    return np.stack([np.stack(corner, axis=-1) for corner in corners], axis=1)
+    return np.array(corners).transpose(2, 0, 1)
 
 
 def _turned(mesh: Mesh, at_m: tuple[float, float], angle_rad: float) -> Mesh:
