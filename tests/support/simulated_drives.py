@@ -6,12 +6,12 @@ the libraries that draw it: their bytes and versions name the folder, so nobody 
 
 from __future__ import annotations
 
-import ast
 import fcntl
 import functools
 import hashlib
 import os
 import pickle
+import re
 import shutil
 import sys
 from collections.abc import Callable
@@ -32,6 +32,7 @@ CACHE = REPOSITORY / ".pytest_cache" / "d" / "drives"
 """Where `pytest --cache-clear` clears."""
 
 ROOTS = ("drive.py", "rig_drive.py")
+PACKAGES = ("coec", "coec_lab")
 
 LIBRARIES = ("embreex", "numba", "numpy", "opencv-python-headless")
 
@@ -102,29 +103,32 @@ def _fingerprint() -> str:
     digest = hashlib.sha256(sys.version.encode())
     for library in LIBRARIES:
         digest.update(f"{library} {version(library)}\n".encode())
-    for path in sorted(set().union(*(modules_behind(SERVICE / "coec_lab" / "simulation" / root) for root in ROOTS))):
+    for path in sorted(modules_behind(*(SERVICE / "coec_lab" / "simulation" / root for root in ROOTS))):
         digest.update(f"{path.relative_to(SERVICE)}\n".encode() + path.read_bytes())
     return digest.hexdigest()[:16]
 
 
-def modules_behind(path: Path) -> set[Path]:
-    """The files of both packages that a module reaches by its imports, wherever one stands; itself among them."""
+_IMPORT = re.compile(rb"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+)?import[ \t]+(\([^)]*\)|[^\n]*)", re.MULTILINE)
+"""An import, with the module that names come from and the names: to parse every file takes seconds."""
+
+_NAME = re.compile(rb"[\w.]+")
+
+
+def modules_behind(*paths: Path) -> set[Path]:
+    """The files of both packages that modules reach by their imports, wherever one stands; themselves among them."""
     reached: set[Path] = set()
-    waiting = [path]
+    waiting = list(paths)
     while waiting:
         now = waiting.pop()
         if now in reached:
             continue
         reached.add(now)
-        for node in ast.walk(ast.parse(now.read_bytes())):
-            if isinstance(node, ast.Import):
-                names = [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom) and node.module is not None:
-                names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-            else:
-                continue
-            for name in names:
+        for module, names in _IMPORT.findall(now.read_bytes()):
+            own = module.decode()
+            for name in {own, *(f"{own}.{name.decode()}".lstrip(".") for name in _NAME.findall(names))}:
                 chunks = name.split(".")
+                if chunks[0] not in PACKAGES:
+                    continue
                 for depth in range(1, len(chunks) + 1):
                     location = SERVICE.joinpath(*chunks[:depth])
                     waiting += [

@@ -87,8 +87,9 @@ def quads(corners_m: ArrayLike, colour: ArrayLike, material: Material) -> Mesh:
     halves[:, 0] = four[:, :3]
     halves[:, 1, 0] = four[:, 0]
     halves[:, 1, 1:] = four[:, 2:]
+    shade = np.asarray(colour)
     paint = np.empty((len(four), 2, 3), dtype=np.float32)
-    paint[:] = np.asarray(colour)[..., None, :]
+    paint[:] = shade[:, None] if shade.ndim == 2 else shade
     return triangles(halves, paint.reshape(-1, 3), material)
 
 
