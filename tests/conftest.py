@@ -80,6 +80,11 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.freeze()
 
 
+def pytest_unconfigure() -> None:
+    """What ends with the process is found as waste again: libraries complain of what they believe to be lost."""
+    gc.unfreeze()
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Leave benchmarks to the long run: how fast the machine is at the moment is no verdict on a change.
