@@ -8,7 +8,7 @@ from typing import Any
 
 from coec.schemas import commands, documents, fleet, frames, heartbeat, replies, rig_state
 from coec.schemas.message import Message
-from coec_lab.experiments import evaluation_schema, simulation_schemas
+from coec_lab.experiments import evaluation_schema, resampled_statistics, simulation_schemas
 
 SENT: tuple[type[Message], ...] = (
     frames.CameraFrame,
@@ -38,6 +38,7 @@ MESSAGES: tuple[type[Message], ...] = (
     evaluation_schema.ComparisonReport,
     evaluation_schema.ClosureReport,
     evaluation_schema.ModelAssessment,
+    resampled_statistics.ResampleReport,
     simulation_schemas.MatrixReport,
     simulation_schemas.CheckedDrive,
     simulation_schemas.ChecksReport,
