@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.objective.edges import independent_samples_at
 from coec.calibration.pipeline import calibrate
 from coec.calibration.types import CameraFrame, Decision, DepthMap, DepthModel, Estimate, Silence, StopReason, Window
-from coec.calibration.uncertainty import covariance
 from coec.config import CalibrationConfig, LimitsConfig, ObjectiveConfig, SearchConfig
 from coec.errors import CalibrationError, DecodeError
 from coec.geometry import se3
@@ -167,21 +165,6 @@ def test_sigma_covers_the_error(street: Window, stereo: DepthModel) -> None:
     assert (np.abs(estimate.correction[:3]) < 5.0 * estimate.sigma[:3]).all()
     assert (np.degrees(estimate.sigma[:3]) < 0.5).all()
     assert np.isnan(estimate.sigma[3:]).all()
-
-
-def test_frames_that_are_one_observation_claim_less_of_where_the_camera_is(
-    sharp_street: Window, stereo: DepthModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = CalibrationConfig(search=SearchConfig(dof=6, reach_deg=5.0))
-    several = solve(sharp_street, stereo, config).sigma
-    monkeypatch.setattr(
-        covariance,
-        "independent_samples_at",
-        lambda edges, pose: replace(independent_samples_at(edges, pose), count=1.0),
-    )
-    one = solve(sharp_street, stereo, config).sigma
-    assert (one >= several).all()
-    assert (one[3:] > several[3:]).all()
 
 
 def test_a_window_without_pairs_is_an_error(street: Window, stereo: DepthModel) -> None:

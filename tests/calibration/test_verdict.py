@@ -21,7 +21,7 @@ from coec.calibration.types import (
     Verdict,
     Window,
 )
-from coec.calibration.uncertainty.nuisance_parameters import CLOCKS_FREE, LENS_FREE, RelaxedAssumption
+from coec.calibration.uncertainty.posterior import Hypothesis, Posterior
 from coec.calibration.verdict import (
     change_metric,
     counted_once,
@@ -202,22 +202,25 @@ def test_what_is_no_knock_does_not_refuse(change: ChangePoint | None) -> None:
     assert verdict_after(change).decision is Decision.ACCEPTED
 
 
-def relaxed(name: str, certainty: float, moved_px: float) -> RelaxedAssumption:
-    return RelaxedAssumption(name, certainty, moved_px, np.zeros(12), np.zeros(6), believed=1.0)
+def posterior_of(**probabilities: float) -> Posterior:
+    """Hypotheses by name, with their probabilities."""
+    return Posterior(
+        tuple(Hypothesis(name, p, np.zeros(13), np.eye(13), 20.0) for name, p in probabilities.items()), 0.1
+    )
 
 
 @pytest.mark.parametrize(
-    ("result", "refused"),
+    ("found", "refused"),
     [
-        (relaxed(LENS_FREE, 3.0, 1.0), True),
-        (relaxed(LENS_FREE, 3.0, 0.1), False),
-        (relaxed(LENS_FREE, 1.0, 1.0), False),
-        (relaxed(CLOCKS_FREE, 3.0, 1.0), False),
+        (posterior_of(nominal=0.01, lens_off=0.99), True),
+        (posterior_of(nominal=0.4, lens_off=0.3, focal_length_off=0.3), True),
+        (posterior_of(nominal=0.7, principal_point_off=0.3), False),
+        (posterior_of(nominal=0.01, clocks_free=0.99), False),
     ],
-    ids=["another lens", "one that hardly matters", "one that is not certain", "other clocks"],
+    ids=["another lens", "a lens that is off one way or another", "one that is not certain", "other clocks"],
 )
-def test_a_window_through_another_lens_is_refused_for_that(result: RelaxedAssumption, refused: bool) -> None:
-    verdict = verdict_on(of_objective=(*OUTSTANDING, *intrinsics_metric([result], LIMITS)))
+def test_a_window_through_another_lens_is_refused_for_that(found: Posterior, refused: bool) -> None:
+    verdict = verdict_on(of_objective=(*OUTSTANDING, *intrinsics_metric(found, LIMITS)))
     assert [reason.code for reason in verdict.reasons] == ([INTRINSICS_OFF] if refused else [])
     assert verdict.shows_another_lens is refused
     if refused:

@@ -294,7 +294,7 @@ def corner_edge_levels(seen_px: list[Array], measured_m: list[Array]) -> list[Ed
         camera = scaled(CORNER_CAMERA, 0.5**halvings, 0.5**halvings)
         blur_px = 1.0 if halvings == 0 else 2.0
         kernel = np.exp(-0.5 * (np.arange(-6, 7) / blur_px) ** 2)
-        maps = np.zeros((CORNER_FRAMES, camera.height, camera.width))
+        maps = np.zeros((len(seen_px), camera.height, camera.width))
         for image, uv in zip(maps, seen_px, strict=True):
             column, row = np.round((uv + 0.5) * 0.5**halvings - 0.5).astype(int).T
             inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)

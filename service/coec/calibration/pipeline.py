@@ -46,7 +46,7 @@ def calibrate(
     moved = None
     if result.edges is not None and change is not None and any(m.name == MOVED and not m.passed for m in metrics):
         moved = moved_within(change, result.edges, data)
-    details = verdict.reason_details(optimum.relaxed, moved, window)
+    details = verdict.reason_details(optimum.posterior, moved, window)
     independent_samples, pairs = optimum.uncertainty.independent_samples, len(window.pairs)
     judged = verdict.judge(metrics, optimum.search.stop_reason, independent_samples, pairs, details)
     progress.step("diagnosis", 1, 1)

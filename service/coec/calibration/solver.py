@@ -196,15 +196,6 @@ def _masked(data: WindowData) -> WindowData:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rivals:
-    """Poses under one objective: the best (4, 4), and `others` (4, 4) that might be the true one."""
-
-    objective: mutual_information.Divisible
-    best: Matrix4
-    others: tuple[Matrix4, ...]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class EstimatorResult:
     """What an estimator found.
 
@@ -212,14 +203,12 @@ class EstimatorResult:
         objective: what it maximised.
         search: the end of the search on it.
         metrics: those that only this objective has.
-        rivals: other summits to which the search came within the same basin.
         edges: the edges of the window; None if it used none.
     """
 
     objective: mutual_information.Divisible
     search: SearchResult
     metrics: tuple[Metric, ...]
-    rivals: tuple[Rivals, ...] = ()
     edges: EdgeCue | None = None
 
 
@@ -381,7 +370,7 @@ def settle_basin(
 ) -> EstimatorResult:
     """The highest summit of the chosen basin on the sharpest edges. `evaluations` were made before and are included in
     the result."""
-    highest, *lower = selected.summits
+    highest = selected.summits[0]
     leading, finest = fusion.settling
     if fusion.depth_contrast(highest) >= TELLING:
         finest = finest.with_depth(_denser(data, fusion.depth, highest, config))
@@ -393,15 +382,7 @@ def settle_basin(
     search = replace(best, evaluations=evaluations + sum(end.evaluations for end in settled))
     if at_rim(best.T_camera_lidar, fusion.start, fusion.reach):
         search = replace(search, stop_reason=StopReason.AT_BOUND)
-    others = [end.T_camera_lidar for end in settled if end is not best]
-    if not _differ(fusion.start, best.T_camera_lidar):
-        # A window that cannot tell the start from the pose found says nothing.
-        others.append(fusion.start)
-    rivals = (
-        Rivals(finest, best.T_camera_lidar, tuple(others)),
-        Rivals(fusion.ranking[-1], highest, tuple(lower)),
-    )
-    return EstimatorResult(finest, search, selected.metrics, rivals, fusion.edges)
+    return EstimatorResult(finest, search, selected.metrics, fusion.edges)
 
 
 def _with_ranks(fusion: Fusion, poses: Sequence[Matrix4]) -> list[RankedPose]:

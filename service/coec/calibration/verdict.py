@@ -9,7 +9,7 @@ rig is commissioned.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from math import degrees, isfinite, radians
+from math import degrees, isfinite, radians, sqrt
 from types import MappingProxyType
 
 import numpy as np
@@ -33,7 +33,7 @@ from coec.calibration.types import (
     Verdict,
     Window,
 )
-from coec.calibration.uncertainty import nuisance_parameters
+from coec.calibration.uncertainty import posterior
 from coec.calibration.uncertainty.covariance import AssessedOptimum
 from coec.config import VerdictConfig
 from coec.geometry import se3
@@ -52,11 +52,14 @@ SAME_SCENE = 0.5
 """A window saw one scene if its independent samples are fewer than this share of its frames. See docs/measured.md."""
 
 
-_CONTRADICTED = {
-    nuisance_parameters.HELD_FREE: "the held centre",
-    nuisance_parameters.CLOCKS_FREE: "the time offset",
-}
-"""What a window contradicts if relaxing this assumption turns the camera."""
+_CONTRADICTED = {posterior.CENTRE_OFF: "the held centre", posterior.CLOCKS_OFF: "the time offset"}
+"""What is off under a hypothesis."""
+
+CAUSES = frozenset({INTRINSICS_OFF, MOVED})
+"""Codes of reasons that explain the others: they are named first."""
+
+EVEN_CERTAINTY = 1.5
+"""Certainty at which the intrinsics are as likely off as right: three standard deviations, each half a unit."""
 
 
 def saw_one_scene(independent_samples: float, frames: int) -> bool:
@@ -118,21 +121,17 @@ def repetition_metric(
     return (Metric("edges_once", independent_samples.significance, limits.min_edges_once, at_least=True),)
 
 
-def intrinsics_metric(
-    relaxed: Sequence[nuisance_parameters.RelaxedAssumption], limits: VerdictConfig
-) -> tuple[Metric, ...]:
-    """How certainly another lens explains the window better than that of the rig; empty if none was tried. A lens that
-    hardly moves the edges (`RelaxedAssumption.matters`) counts as 0."""
-    return tuple(
-        Metric(
-            INTRINSICS_OFF,
-            one.certainty if one.matters else 0.0,
-            limits.max_intrinsics_certainty,
-            at_least=False,
-        )
-        for one in relaxed
-        if one.name == nuisance_parameters.LENS_FREE
-    )
+def intrinsics_metric(found: posterior.Posterior | None, limits: VerdictConfig) -> tuple[Metric, ...]:
+    """How certainly another lens explains the window better than that of the rig; empty if none was tried.
+
+    The logarithm of the odds as half the number of standard deviations that are worth as much, with even odds at
+    `EVEN_CERTAINTY`.
+    """
+    if found is None:
+        return ()
+    nats = posterior.log_odds(found.probability(*posterior.OF_LENS))
+    certainty = sqrt(max(EVEN_CERTAINTY**2 + 0.25 * nats, 0.0))
+    return (Metric(INTRINSICS_OFF, certainty, limits.max_intrinsics_certainty, at_least=False),)
 
 
 def optimum_metrics(
@@ -149,37 +148,36 @@ def optimum_metrics(
         *counted_once(of_objective, optimum.uncertainty.independent_samples, len(pairs)),
         *shape_metrics(evaluation, optimum.curvature, optimum.sigma, limits),
         *repetition_metric(optimum.independent, pairs, limits),
-        *intrinsics_metric(optimum.relaxed, limits),
+        *intrinsics_metric(optimum.posterior, limits),
         *change_metric(change, limits),
     )
 
 
-def reason_details(
-    relaxed: Sequence[nuisance_parameters.RelaxedAssumption], moved: MovedWithin | None, window: Window
-) -> Mapping[str, str]:
+def reason_details(found: posterior.Posterior | None, moved: MovedWithin | None, window: Window) -> Mapping[str, str]:
     """By the name of a metric, what its failure means in this window."""
     return {
-        "sigma_deg": _contradictions_text(relaxed),
-        INTRINSICS_OFF: _lens_text(relaxed, window),
+        "sigma_deg": "" if found is None else _contradictions_text(found),
+        INTRINSICS_OFF: "" if found is None else _lens_text(found, window),
         MOVED: "" if moved is None else _move_text(moved, window),
     }
 
 
-def _contradictions_text(relaxed: Sequence[nuisance_parameters.RelaxedAssumption]) -> str:
+def _contradictions_text(found: posterior.Posterior) -> str:
     """Which assumptions the window contradicts, and by how much the camera turns without each."""
     turns = [
-        f"estimating {_CONTRADICTED[one.name]}, too, turns it by {degrees(float(np.linalg.norm(one.shift[:3]))):.1f}°"
-        for one in relaxed
-        if one.contradicts and one.name in _CONTRADICTED
+        f"estimating {_CONTRADICTED[one.name]}, too, turns it by "
+        f"{degrees(float(np.linalg.norm(one.deviation[:3]))):.1f}°"
+        for one in found.hypotheses
+        if one.name in _CONTRADICTED and one.probability >= 0.5
     ]
     return f" ({'; '.join(turns)})" if turns else ""
 
 
-def _lens_text(relaxed: Sequence[nuisance_parameters.RelaxedAssumption], window: Window) -> str:
-    lens = [one.deviation[nuisance_parameters.LENS] for one in relaxed if one.name == nuisance_parameters.LENS_FREE]
-    if not lens:
+def _lens_text(found: posterior.Posterior, window: Window) -> str:
+    lens = found.of(*posterior.OF_LENS)
+    if lens is None:
         return ""
-    (right, down, longer), camera = lens[0].tolist(), window.rig.camera
+    (right, down, longer, _), camera = lens.lens.tolist(), window.rig.camera
     return (
         f" (focal length {100.0 * longer:+.1f} %, principal point {right * camera.fx:+.1f} px right and "
         f"{down * camera.fy:+.1f} px down)"
@@ -221,6 +219,7 @@ def judge(
         for metric in metrics
         if not metric.passed
     ]
+    reasons.sort(key=lambda reason: reason.code not in CAUSES)
     if stop is not StopReason.TOLERANCE:
         reasons.append(
             Reason(stop.value, "the search did not converge within its bounds, so the true pose may lie outside")

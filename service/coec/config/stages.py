@@ -141,9 +141,9 @@ class VerdictConfig(ConfigModel):
         default=0.5, ge=0, le=1, description="least ratio of points in view to the most that any pose of the box sees"
     )
     min_range_edges: int = Field(
-        default=800,
+        default=200,
         ge=1,
-        description="least independent range jumps in the window's sweeps, twice as many with 6 dof; a few hundred fit "
+        description="least independent range jumps in the window's sweeps, twice as many with 6 dof; a hundred fit "
         "wrong poses by chance (fused)",
     )
     min_edge_contrast: float = Field(
@@ -170,7 +170,7 @@ class VerdictConfig(ConfigModel):
         "frame's score; above: the camera moved within the window (fused)",
     )
     max_intrinsics_certainty: float = Field(
-        default=2.0,
+        default=1.5,
         gt=0,
         description="largest certainty that another lens explains the window better: half its distance in standard "
         "deviations; at 1.5 that lens is as likely, and σ grows by what it moves; above this limit the intrinsics are "
@@ -181,6 +181,18 @@ class VerdictConfig(ConfigModel):
         ge=0,
         description="how well the camera's centre is known along each axis if it is not searched: standard deviation "
         "of a mount that was measured with a rule or taken from a drawing, m",
+    )
+    principal_point_sigma: float = Field(
+        default=0.0007,
+        gt=0,
+        description="how well the principal point of the camera is known along each axis of the image: standard "
+        "deviation as a share of the image's width (1 px in 1,400)",
+    )
+    focal_length_sigma: float = Field(
+        default=0.002,
+        gt=0,
+        description="how well the focal length of the camera is known: standard deviation as a share of it; half of "
+        "that for the first radial term at a corner of the image",
     )
     min_change_deg: float = Field(
         default=0.25, ge=0, description="a smaller turn within a window does not refuse the window (fused)"

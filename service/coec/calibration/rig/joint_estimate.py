@@ -71,14 +71,18 @@ OWNERS: Mapping[str, Owner] = {
     "lens_across": LENS,
     "lens_down": LENS,
     "lens_scale": LENS,
+    "lens_radial": LENS,
     "near_edges_across": LENS,
     "near_edges_down": LENS,
     "columns": SWEEP,
     "stamps": CLOCKS,
+    "clock_offset": CLOCKS,
+    "clock_drift": CLOCKS,
+    "readout": CLOCKS,
 }
 """The owner of each error by its name in `uncertainty.systematic`; any other error is the pair's own."""
 
-LASTING = frozenset({"lens_across", "lens_down", "lens_scale"})
+LASTING = frozenset({"lens_across", "lens_down", "lens_scale", "lens_radial"})
 """Errors that a sensor has whatever it sees. The others change with the scene: how far edges of near things, or
 columns, lie aside depends on it."""
 

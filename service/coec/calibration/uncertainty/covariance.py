@@ -1,27 +1,16 @@
-"""How far an optimum may be off, all in all: by chance (the sandwich covariance J⁻¹·V·J⁻¹, Huber 1967), by ridges that
-are wider than their top, by other modes, by errors that all frames share, and by assumptions that the window itself
-contradicts.
+"""How far an optimum may be off.
 
-The sandwich has V from the scatter of the score between frames and between sectors of the image. Both are needed: all
-frames of a standing vehicle show the same and so agree on anything, but its sectors, which show different things, do
-not; and a wrong lens acts on a sector in every frame alike.
-
-A covariance describes a hill only at its top. A ridge stays flat where a paraboloid with the same top has fallen, and
-the optimum may lie anywhere on it. So the hill is walked down until its drop is certain; how wide it counts follows
-from how certain the drop is on the way.
-
-Other modes are poses that the window cannot distinguish from the optimum: those at which a search ended or began, the
-one next to the camera's place before the search, and the profile of the objective along each translation. A shift and a
-turn make up for each other on all but near things, along a ridge that bends: a straight walk from its top leaves it.
-Many independent samples make the ridge short. A single one leaves dents in it, any of which may be the top. So the
-ridge is followed as far as an accepted translation may be off. The mode next to the known place is a rival of the pose
-found, whatever way the search took, because chance makes several hills if few things are seen again and again.
+With edges, from the posterior of the window over pose, lens and clocks (`posterior`), and from errors of the sensors
+that no window shows (`systematic`). An objective without edges has only its scatter: the sandwich covariance J⁻¹·V·J⁻¹
+(Huber 1967), with V between frames and between sectors of the image. Both are needed: all frames of a standing vehicle
+show the same and so agree on anything, but its sectors, which show different things, do not. A covariance describes a
+hill only at its top, so the hill is walked down until its drop is certain; how wide it counts follows from how certain
+the drop is on the way.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from math import exp, fsum, sqrt
+from math import fsum, hypot, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,16 +20,14 @@ from coec.calibration.objective.edges import IndependentSamples, independent_sam
 from coec.calibration.objective.landscape import Curvature, Landscape, measure_curvature
 from coec.calibration.objective.mutual_information import Divisible
 from coec.calibration.search import local_search
-from coec.calibration.search.local_search import TRANSLATIONS, FixedCentre, SearchResult
-from coec.calibration.solver import EstimatorResult, Rivals, WindowData
-from coec.calibration.types import Matrix4, Silence, Uncertainty, Window
-from coec.calibration.uncertainty import nuisance_parameters as nuisance
-from coec.calibration.uncertainty.nuisance_parameters import SHIFTS, ParameterSubset, RelaxedAssumption
-from coec.calibration.uncertainty.systematic import sensor_resolution, systematic_shifts
+from coec.calibration.search.local_search import TRANSLATIONS, SearchResult
+from coec.calibration.solver import EstimatorResult, WindowData
+from coec.calibration.types import Matrix4, Uncertainty, Window
+from coec.calibration.uncertainty.posterior import Posterior, measure_posterior
+from coec.calibration.uncertainty.systematic import OF_SENSORS, lens_error_px, sensor_resolution, systematic_shifts
 from coec.config import CalibrationConfig
 from coec.geometry import se3
-from coec.geometry.edges.alignment import EdgeFrames
-from coec.geometry.linalg import Rows, congruent, eigen, inverted, solved
+from coec.geometry.linalg import Rows, congruent, eigen, inverted
 
 WIDER = (1.0, 2.0, 4.0)
 """Difference steps, in steps of the cells, that are tried until the objective has a maximum: a ripple may dent the top
@@ -210,108 +197,33 @@ def _open_up_to(certainty: float) -> float:
     return min(certainty, CERTAIN + ABOUT) - falling * falling / (4.0 * ABOUT)
 
 
-SAME_HILL = 3.0
-"""A pose within this many standard deviations belongs to the hill of the optimum, whose width is counted already."""
-
-
-def with_modes(rivals: Rivals, moved: Sequence[int], covariance: list[list[float]]) -> list[list[float]]:
-    """The covariance (n, n) of the axes `moved`, about the best summit, of a mixture with the other summits.
-
-    A summit has the weight exp(-2·c²), where c is the certainty by which the best one stands above it. That is the
-    likelihood exp(-d²/2) of a pose that is as far down on a paraboloid. A summit above the best has the weight 1.
-    """
-    axes = tuple(moved)
-    aways = [se3.difference(other, rivals.best)[list(axes)].tolist() for other in rivals.others]
-    aways_and_poses = [
-        (away, other) for away, other in zip(aways, rivals.others, strict=True) if _on_another_hill(away, covariance)
-    ]
-    if not aways_and_poses:
-        return covariance
-    landscape = Landscape.about(rivals.objective.cells(rivals.best), rivals.best, axes)
-    at_others = landscape.cells.at(np.array([other for _, other in aways_and_poses]))
-    weighted = [
-        (exp(-2.0 * max(landscape.certainty(cells), 0.0) ** 2), away)
-        for (away, _), cells in zip(aways_and_poses, at_others, strict=True)
-    ]
-    whole = 1.0 + fsum(weight for weight, _ in weighted)
-    n = range(len(axes))
-    return [[covariance[i][j] + fsum(w * away[i] * away[j] for w, away in weighted) / whole for j in n] for i in n]
-
-
-def _on_another_hill(away: list[float], covariance: list[list[float]]) -> bool:
-    """Whether a summit that lies `away` (n,) from the best one is on another hill."""
-    return fsum(a * b for a, b in zip(away, solved(covariance, away), strict=True)) > SAME_HILL**2
-
-
-SIGNS = (1.0, -1.0)
-
-
-def translation_profile(objective: Divisible, pose: Matrix4, moved: Sequence[int], config: CalibrationConfig) -> Rivals:
-    """The best poses with the camera `verdict.max_sigma_m` aside of the optimum at `pose` (4, 4), either way along each
-    translation among the axes `moved`: the profile of the objective there. There are no such poses if only rotations
-    moved."""
-    held = tuple(axis for axis in TRANSLATIONS if axis not in moved)
-    search = local_search.near(config.search, objective)
-    ends = []
-    for axis in moved:
-        if axis not in TRANSLATIONS:
-            continue
-        for way in SIGNS:
-            displaced = se3.perturb(pose, way * config.verdict.max_sigma_m * np.eye(6)[axis])
-            constraint = FixedCentre((axis, *held), displaced)
-            end = local_search.polish(objective, displaced, search, Silence(), 0, constraint)
-            ends.append(end.T_camera_lidar)
-    return Rivals(objective, pose, tuple(ends))
-
-
-def mode_next_to_prior(edges: Sequence[EdgeFrames], window: Window, pose: Matrix4) -> Matrix4 | None:
-    """The pose (4, 4) of the most significant alignment next to the camera's centre at the window's start. The climb
-    begins with the rotation of `pose` (4, 4); it first turns only, then also shifts. None if the edges in view
-    determine no pose.
-
-    `edges` are those of the window, from coarser levels that lead there to the sharpest one.
-    """
-    start_pose = FixedCentre(tuple(SHIFTS), window.T_camera_lidar_start)(pose)
-    levels = nuisance.assumed_levels(edges, window, start_pose)
-    nothing, turns, every = np.zeros(nuisance.SIZE), tuple(nuisance.TURNS), (*nuisance.TURNS, *SHIFTS)
-    try:
-        turned = nuisance.local_ascent(levels, ParameterSubset.of(levels[-1], nothing, turns, ()), nothing)
-        deviation = nuisance.local_ascent(levels, ParameterSubset.of(levels[-1], turned, every, ()), turned)
-    except ValueError:
-        return None
-    return se3.perturb(start_pose, deviation[: SHIFTS.stop])
-
-
-def measure_uncertainty(
-    objective: Divisible,
-    pose: Matrix4,
-    moved: Sequence[int],
-    rivals: Sequence[Rivals],
-    relaxed: Sequence[RelaxedAssumption],
-    window: Window,
-    held_m: float,
+def _scattered(
+    objective: Divisible, pose: Matrix4, moved: tuple[int, ...], window: Window, held_m: float
 ) -> Uncertainty:
-    """The uncertainty of the optimum at `pose` (4, 4), searched along the axes `moved` of ξ; unknown if the objective
-    has no maximum there or the frames are too few.
-
-    `rivals` are other summits that the search found. `relaxed` is how the pose moves when assumptions are set free. A
-    held translation is known to `held_m`.
-    """
-    axes = tuple(moved)
-    landscape = Landscape.about(objective.cells(pose), pose, axes)
+    """The uncertainty of an optimum at `pose` (4, 4) from the scatter of an objective without edges, searched along the
+    axes `moved` of ξ; unknown if the objective has no maximum there or the frames are too few."""
+    landscape = Landscape.about(objective.cells(pose), pose, moved)
     noise = measure_noise(landscape)
     if noise is None:
         return Uncertainty.unknown()
-    covariance = widened(landscape, noise)
-    for summits in rivals:
-        covariance = with_modes(summits, axes, covariance)
     whole = np.full((6, 6), np.nan)
-    whole[np.ix_(axes, axes)] = covariance
-    axis_of_sweep = pose[:3, 2]  # the third axis of the LiDAR
-    shared = systematic_shifts(landscape.cells.points, sensor_resolution(window, pose, held_m), axes, axis_of_sweep)
-    for one in relaxed:
-        shared[one.name] = one.believed * np.where(np.isin(np.arange(6), axes), one.shift, 0.0)
+    whole[np.ix_(moved, moved)] = widened(landscape, noise)
+    resolution = sensor_resolution(window, pose, held_m)
+    shared = systematic_shifts(landscape.cells.points, resolution, moved, pose[:3, 2])
     return Uncertainty(whole, shared, noise.independent_samples)
+
+
+def _posterior_uncertainty(
+    posterior: Posterior, objective: Divisible, pose: Matrix4, moved: tuple[int, ...], window: Window, samples: float
+) -> Uncertainty:
+    """The uncertainty of an optimum at `pose` (4, 4), searched along the axes `moved` of ξ, from the posterior of its
+    window: the nominal hypothesis, the distance to the others, and the errors of the sensors that no window shows."""
+    whole = np.full((6, 6), np.nan)
+    whole[np.ix_(moved, moved)] = posterior.noise(moved)
+    resolution = sensor_resolution(window, pose, 0.0)
+    every = systematic_shifts(objective.cells(pose).points, resolution, moved, pose[:3, 2])
+    of_sensors = {name: shift for name, shift in every.items() if name in OF_SENSORS}
+    return Uncertainty(whole, of_sensors | posterior.shifts(moved), samples)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -323,7 +235,7 @@ class AssessedOptimum:
         unobservable: the translations (places in ξ) that were searched but that the window does not determine. Along
             these the camera's centre is that of the start.
         curvature: of the objective at the pose.
-        relaxed: what changes when the assumptions (held centre, clocks, lens) are relaxed one by one.
+        posterior: of pose, lens and clocks; None if the estimator used no edges, or they determine no pose.
         independent: how many independent frames the window is worth; None if the estimator used no edges.
         uncertainty: of the pose.
         sigma: (6,) its standard deviations, rad and m; NaN on axes that were not determined.
@@ -332,30 +244,35 @@ class AssessedOptimum:
     search: SearchResult
     unobservable: tuple[int, ...]
     curvature: Curvature
-    relaxed: tuple[RelaxedAssumption, ...]
+    posterior: Posterior | None
     independent: IndependentSamples | None
     uncertainty: Uncertainty
     sigma: NDArray[np.float64]
 
 
 def assess_optimum(result: EstimatorResult, data: WindowData, config: CalibrationConfig) -> AssessedOptimum:
-    """The uncertainty of what an estimator found. If it shows that the window does not determine a translation, the
-    search is finished again with the camera's centre held there, and its new end is assessed."""
+    """The uncertainty of what an estimator found. If its posterior has another mode that is more probable, that one is
+    polished and assessed. If the window does not determine a translation, the search is finished again with the
+    camera's centre held there, and its new end is assessed."""
     start, dof, limits = data.window.T_camera_lidar_start, config.search.dof, config.verdict
     held = tuple(axis for axis in TRANSLATIONS if axis >= dof)
-    rivals = (*result.rivals, *_prior_mode(result, data.window, dof))
-    optimum = _assessed(result, result.search, rivals, (), held, limits.held_translation_sigma_m, data.window, config)
+    optimum = _assessed(result, result.search, (), held, limits.held_translation_sigma_m, data.window, config)
+    better = None if optimum.posterior is None else optimum.posterior.better_mode
+    if better is not None:
+        mode = se3.perturb(optimum.search.T_camera_lidar, np.where(np.arange(6) < dof, better.deviation[:6], 0.0))
+        polished = local_search.polish(result.objective, mode, config.search, data.progress, optimum.search.evaluations)
+        search = replace(polished, stop_reason=result.search.stop_reason)
+        optimum = _assessed(result, search, (), held, limits.held_translation_sigma_m, data.window, config)
     blind = local_search.unobservable(optimum.curvature, optimum.sigma, dof, limits)
     if not blind:
         return optimum
-    search = local_search.without(blind, result.search, result.objective, start, config.search, data.progress)
-    return _assessed(result, search, rivals, blind, blind, limits.max_sigma_m, data.window, config)
+    search = local_search.without(blind, optimum.search, result.objective, start, config.search, data.progress)
+    return _assessed(result, search, blind, blind, limits.max_sigma_m, data.window, config)
 
 
 def _assessed(
     result: EstimatorResult,
     search: SearchResult,
-    rivals: tuple[Rivals, ...],
     blind: tuple[int, ...],
     held: tuple[int, ...],
     held_to_m: float,
@@ -366,24 +283,14 @@ def _assessed(
     objective, edges, pose, dof = result.objective, result.edges, search.T_camera_lidar, config.search.dof
     moved = tuple(axis for axis in range(dof) if axis not in blind)
     curvature = measure_curvature(objective, pose, dof, blind)
-    # From bands that still feel a lens which is off by pixels to the sharpest edges.
-    relaxed = () if edges is None else nuisance.relax_assumptions(edges.to_the_sharpest, window, pose, held, held_to_m)
-    independent = None if edges is None else independent_samples_at(edges.sharp, pose)
-    if independent is not None and independent.count < len(moved):
-        # Frames that are worth fewer samples than there are axes leave dents in every ridge of the objective.
-        rivals = (*rivals, translation_profile(objective, pose, moved, config))
-    held_m = config.verdict.held_translation_sigma_m
-    uncertainty = measure_uncertainty(objective, pose, moved, rivals, relaxed, window, held_m)
-    if independent is not None:
-        uncertainty = replace(uncertainty, independent_samples=independent.count)
-    return AssessedOptimum(search, blind, curvature, relaxed, independent, uncertainty, uncertainty.sigma)
-
-
-def _prior_mode(result: EstimatorResult, window: Window, dof: int) -> tuple[Rivals, ...]:
-    """The summit next to the camera's place before the search, as a rival of the pose found. Empty without edges,
-    without searched translations, or without such a summit."""
-    if result.edges is None or dof <= TRANSLATIONS.start:
-        return ()
-    pose = result.search.T_camera_lidar
-    summit = mode_next_to_prior(result.edges.to_the_sharpest, window, pose)
-    return () if summit is None else (Rivals(result.objective, pose, (summit,)),)
+    posterior, independent, uncertainty = None, None, Uncertainty.unknown()
+    if edges is None:
+        uncertainty = _scattered(objective, pose, moved, window, config.verdict.held_translation_sigma_m)
+    else:
+        independent = independent_samples_at(edges.sharp, pose)
+        limits, fitted_px = config.verdict, lens_error_px(window.rig.camera_residual_px)
+        lens = hypot(limits.principal_point_sigma * window.rig.camera.width, fitted_px), limits.focal_length_sigma
+        posterior = measure_posterior((*reversed(edges.bands), edges.sharp), window, pose, held, held_to_m, lens)
+        if posterior is not None:
+            uncertainty = _posterior_uncertainty(posterior, objective, pose, moved, window, independent.count)
+    return AssessedOptimum(search, blind, curvature, posterior, independent, uncertainty, uncertainty.sigma)

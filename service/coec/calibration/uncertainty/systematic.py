@@ -206,6 +206,9 @@ TERMS: MappingProxyType[str, Term] = MappingProxyType(
 """The terms by name, in a fixed order. The lens is displaced to the right, down and outwards (principal point and focal
 length); finer errors of it differ from sector to sector of the image and are in the scatter."""
 
+OF_SENSORS = frozenset({"near_edges_across", "near_edges_down", "columns", "stamps"})
+"""Terms that are not parameters of the posterior of a window."""
+
 HELD: MappingProxyType[int, str] = MappingProxyType({3: "held_across", 4: "held_down", 5: "held_forward"})
 """Names of further terms, one for each translation that was not searched, by its place in ξ."""
 

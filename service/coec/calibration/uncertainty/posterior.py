@@ -1,0 +1,443 @@
+"""The posterior of a window over its pose, lens and clocks, and the hypotheses that compete to explain it.
+
+The log-likelihood of a deviation is κ·z²/2, the profile over the amplitude of the edges of that of independent standard
+deviates. Range edges are not independent: neighbours in a sweep, and frames of one view, say the same. κ is the share
+of them that is: the magnitude adjustment of a composite likelihood (Pace, Salvan, Sartori 2011), from the scatter of
+its gradient between frames and between sectors of the image, at an optimum that fits (as the variance inflation of a
+quasi-likelihood is from the most general hypothesis: Burnham, Anderson 2002, section 2.5). One number for all
+parameters, so that a few frames suffice.
+
+Each hypothesis is a Gaussian prior of the deviation: all as calibrated; the lens a little or grossly off; the clocks
+off; the held centre off. Its evidence is the integral of the posterior (Laplace's approximation, with the width of
+each direction from the profile where it is not Gaussian). So a hypothesis that needs a wide prior has to fit that much
+better, and a window that does not tell two of them apart leaves both their prior odds.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from math import fsum, log, radians, sqrt
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.objective.mutual_information import COLUMNS, ROWS, sectors
+from coec.calibration.types import Matrix4, Window
+from coec.calibration.uncertainty.ascent import (
+    CURVATURE_PX2,
+    STEP_PX,
+    Ascent,
+    Coordinates,
+    Vector,
+    ascent,
+    inverse_root,
+    metric,
+    negative_hessian,
+)
+from coec.calibration.uncertainty.displaced_edges import (
+    CLOCKS,
+    LENS,
+    SHIFTS,
+    SIZE,
+    TURNS,
+    AssumedEdges,
+    assumed_levels,
+    moves,
+)
+from coec.geometry import linalg
+from coec.geometry.edges.alignment import LEAST_SQUARE, EdgeFrames
+from coec.geometry.edges.displaced_alignment import DisplacedEdges
+
+NOMINAL, OTHER_MODE = "nominal", "other_mode"
+PRINCIPAL_POINT_OFF, FOCAL_LENGTH_OFF, LENS_OFF = "principal_point_off", "focal_length_off", "lens_off"
+CLOCKS_OFF, CENTRE_OFF = "clocks_free", "held_free"
+"""Names of the hypotheses. They are also names of errors of a pose; see `Posterior.shifts`."""
+
+OF_LENS = (PRINCIPAL_POINT_OFF, FOCAL_LENGTH_OFF, LENS_OFF)
+
+ODDS: Mapping[str, float] = MappingProxyType(
+    {
+        NOMINAL: 0.8,
+        OTHER_MODE: 0.8,
+        PRINCIPAL_POINT_OFF: 0.05,
+        FOCAL_LENGTH_OFF: 0.05,
+        LENS_OFF: 0.02,
+        CLOCKS_OFF: 0.04,
+        CENTRE_OFF: 0.04,
+    }
+)
+"""Prior probabilities of the hypotheses, up to a common factor."""
+
+LENS_DRIFT = 0.01
+"""Prior of the principal point, in focal lengths, or of the focal length, as a share, of a lens that has changed since
+it was calibrated, or was not calibrated with care. Its radial term has half of it."""
+
+LENS_WRONG = (0.05, 0.05, 0.1, 0.02)
+"""Prior of intrinsics of another camera, crop or scale."""
+
+CLOCKS_KNOWN, CLOCKS_WRONG = (0.002, 0.001, 0.002), (0.05, 0.02, 0.03)
+"""Prior of the clocks, s: as synchronised; and where a stamp is taken at another instant than it says."""
+
+CENTRE_WRONG_M = 0.2
+
+TURN_RAD, SHIFT_M = radians(5.0), 0.5
+"""Prior of the pose about its optimum: wide against any σ that is accepted."""
+
+NAMES = MappingProxyType(
+    {
+        3: "held_across",
+        4: "held_down",
+        5: "held_forward",
+        6: "clock_offset",
+        7: "clock_drift",
+        8: "readout",
+        9: "lens_across",
+        10: "lens_down",
+        11: "lens_scale",
+        12: "lens_radial",
+    }
+)
+"""Names of the errors of a pose by their places in a deviation."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypothesis:
+    """One explanation of a window.
+
+    Attributes:
+        name: see `NOMINAL`.
+        probability: of this among all hypotheses.
+        deviation: (13,) the most probable one.
+        covariance: (13, 13) of the deviation; zero at places that are not free.
+        significance: z of the edges at the deviation.
+    """
+
+    name: str
+    probability: float
+    deviation: Vector
+    covariance: NDArray[np.float64]
+    significance: float
+
+    @property
+    def lens(self) -> Vector:
+        """(4,) the deviation of the lens."""
+        return self.deviation[list(LENS)]
+
+    @property
+    def lens_sigma(self) -> Vector:
+        """(4,) standard deviations of the lens."""
+        return np.asarray(np.sqrt(self.covariance.diagonal()[LENS]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posterior:
+    """All hypotheses about a window, and the share of its range edges that is independent."""
+
+    hypotheses: tuple[Hypothesis, ...]
+    independent_share: float
+
+    def of(self, *names: str) -> Hypothesis | None:
+        """The most probable of the hypotheses of these names; None if none was tried."""
+        return max((one for one in self.hypotheses if one.name in names), key=lambda one: one.probability, default=None)
+
+    def probability(self, *names: str) -> float:
+        """Of the hypotheses of these names together."""
+        return fsum(one.probability for one in self.hypotheses if one.name in names)
+
+    @property
+    def better_mode(self) -> Hypothesis | None:
+        """Another mode of the nominal hypothesis that is more probable than the one about the given pose."""
+        other = self.of(OTHER_MODE)
+        return other if other is not None and other.probability > self.hypotheses[0].probability else None
+
+    def noise(self, moved: Sequence[int]) -> NDArray[np.float64]:
+        """(n, n) covariance of the pose along n axes of ξ under the nominal hypothesis, with all else known."""
+        covariance, axes = self.hypotheses[0].covariance, list(moved)
+        beside, follow = self._conditional(axes)
+        among = covariance[np.ix_(axes, axes)] - linalg.product(covariance[np.ix_(axes, beside)], follow)
+        return np.asarray(0.5 * (among + among.T))
+
+    def shifts(self, moved: Sequence[int]) -> dict[str, Vector]:
+        """By the name of each error, (6,) the shift of the pose along the axes `moved` by one standard deviation.
+
+        The errors of the nominal hypothesis are the columns of a factor of its covariance. Each hypothesis adds how far
+        its pose is from the one that was found, by the root of its probability: the root mean square of a mixture.
+        """
+        nominal, axes = self.hypotheses[0], list(moved)
+        beside, follow = self._conditional(axes)
+        factor = linalg.cholesky(nominal.covariance[np.ix_(beside, beside)])
+        columns = linalg.product(follow.T, factor)
+        shifts = {NAMES[place]: _at(axes, column) for place, column in zip(beside, columns.T, strict=True)}
+        for one in self.hypotheses:
+            shifts[one.name] = _at(axes, sqrt(one.probability) * one.deviation[axes])
+        return shifts
+
+    def _conditional(self, axes: list[int]) -> tuple[list[int], NDArray[np.float64]]:
+        """The m places of a deviation beside the axes of the pose, and (m, n) how these follow them."""
+        covariance = self.hypotheses[0].covariance
+        beside = [place for place in NAMES if place not in axes and covariance[place, place] > 0.0]
+        among = linalg.cholesky(covariance[np.ix_(beside, beside)])
+        return beside, linalg.cholesky_solve(among, covariance[np.ix_(beside, axes)])
+
+
+def _at(axes: Sequence[int], values: Vector) -> Vector:
+    shift = np.zeros(6)
+    shift[list(axes)] = values
+    return shift
+
+
+def measure_posterior(
+    edges: Sequence[EdgeFrames],
+    window: Window,
+    pose: Matrix4,
+    held: Sequence[int],
+    held_m: float,
+    lens_sigma: tuple[float, float],
+) -> Posterior | None:
+    """The posterior of a window; None if its edges determine no pose.
+
+    Args:
+        edges: of the window, from coarser levels that lead to the sharpest one.
+        window: the window.
+        pose: (4, 4) where its search ended.
+        held: the translations (places in ξ) that were not searched.
+        held_m: the standard deviation to which each of them is known.
+        lens_sigma: standard deviations of the principal point, px, and of the focal length, as a share of it.
+    """
+    levels = assumed_levels(edges, window, pose)
+    clocks = tuple(CLOCKS) if moves(window) else ()
+    places = (*TURNS, *SHIFTS, *clocks, *LENS)
+    priors = _priors(window, held, held_m, lens_sigma, moving=bool(clocks))
+    try:
+        general = _general_optimum(levels, places, priors)
+        nominal = ascent(levels[-1:], np.zeros(SIZE), places, priors[NOMINAL], GENERAL_SHARE)
+        fits = nominal.significance >= AS_GOOD * general.significance
+        share = independent_share(levels[-1], (nominal if fits else general).deviation)
+        found = [_fitted(name, levels, places, prior, general.deviation, share) for name, prior in priors.items()]
+        found += _other_mode(found[0], levels, places, priors[NOMINAL], general.deviation, share)
+    except ValueError:
+        return None
+    evidence = np.array([log(ODDS[one.name]) + one.log_evidence for one in found])
+    weights = np.exp(evidence - evidence.max())
+    total = fsum(weights.tolist())
+    return Posterior(
+        tuple(
+            Hypothesis(one.name, float(weight) / total, one.deviation, one.covariance, one.significance)
+            for one, weight in zip(found, weights, strict=True)
+        ),
+        share,
+    )
+
+
+def _priors(
+    window: Window, held: Sequence[int], held_m: float, lens_sigma: tuple[float, float], *, moving: bool
+) -> dict[str, Vector]:
+    """(13,) standard deviations of the deviation, by hypothesis; the first is the nominal one."""
+    camera, (pixels, share) = window.rig.camera, lens_sigma
+    nominal = np.empty(SIZE)
+    nominal[TURNS], nominal[SHIFTS] = TURN_RAD, SHIFT_M
+    nominal[list(held)] = max(held_m, 1e-4)
+    nominal[CLOCKS] = CLOCKS_KNOWN
+    nominal[LENS] = pixels / camera.fx, pixels / camera.fy, share, 0.5 * share
+    others = {
+        PRINCIPAL_POINT_OFF: (LENS[:2], (LENS_DRIFT, LENS_DRIFT)),
+        FOCAL_LENGTH_OFF: (LENS[2:], (LENS_DRIFT, 0.5 * LENS_DRIFT)),
+        LENS_OFF: (LENS, LENS_WRONG),
+        **({CLOCKS_OFF: (CLOCKS, CLOCKS_WRONG)} if moving else {}),
+        **({CENTRE_OFF: (SHIFTS, (CENTRE_WRONG_M,) * 3)} if held else {}),
+    }
+    priors = {NOMINAL: nominal}
+    for name, (places, wide) in others.items():
+        priors[name] = nominal.copy()
+        priors[name][places] = np.maximum(nominal[places], wide)
+    return priors
+
+
+ZOOMS = (-0.3, -0.18, -0.09, 0.0, 0.09, 0.18, 0.3, 0.42)
+ASIDE = (-0.1, -0.05, 0.0, 0.05, 0.1)
+"""Focal lengths, and places of the principal point, at which ascents of the general hypothesis may begin: about as far
+apart as the coarsest edges lead."""
+
+ASCENTS = 3
+"""How many ascents go on from the coarsest edges to the sharpest, beside that from the lens as assumed. One for each
+focal length climbs the coarsest edges."""
+
+GENERAL_SHARE = 0.15
+"""The share of independent edges where it is not known yet: it only weighs the priors of the general hypothesis."""
+
+
+FARTHEST = 5.0
+"""How many standard deviations of its prior a lens may be off."""
+
+AS_GOOD = 0.95
+"""Where the nominal hypothesis is this good, the share of independent edges is measured at its optimum: that of the
+general one lies anywhere along its ridges."""
+
+
+def _general_optimum(levels: Sequence[AssumedEdges], places: tuple[int, ...], priors: Mapping[str, Vector]) -> Ascent:
+    """The most significant deviation with every parameter free, whatever the lens that was assumed."""
+    prior = np.max(list(priors.values()), axis=0)
+    turning = (*TURNS, *LENS[:3])
+    coarse = levels[0].at(np.zeros(SIZE), turning)
+    of_coarse = metric(coarse)
+    answer = linalg.product(linalg.inverse(of_coarse[:3, :3]), of_coarse[:3, 3:])
+    begins = []
+    for longer in ZOOMS:
+        lenses = np.array([(right, down, longer) for right, down in product(ASIDE, ASIDE)])
+        starts = np.concatenate([-linalg.product(lenses, answer.T), lenses], axis=1)
+        begin = np.zeros(SIZE)
+        begin[list(turning)] = starts[np.argmax(coarse.significances(starts))]
+        begins.append(begin)
+    climbed = [ascent(levels[:1], begin, turning, prior, GENERAL_SHARE) for begin in begins]
+    climbed = sorted((end for end in climbed if _of_a_lens(end, prior)), key=lambda end: -end.significance)
+    leading, begins = (*TURNS, *SHIFTS, *LENS[:3]), [np.zeros(SIZE), *(end.deviation for end in climbed[:ASCENTS])]
+    led = [ascent(levels[1:-1], begin, leading, prior, GENERAL_SHARE) for begin in begins]
+    settled = [ascent(levels[-1:], end.deviation, leading, prior, GENERAL_SHARE) for end in led]
+    settled = [end for end in settled if _of_a_lens(end, prior)]
+    if not settled:
+        raise ValueError("no lens within reach fits the edges in view")
+    best = max(settled, key=lambda end: end.significance)
+    general = ascent(levels[-1:], best.deviation, places, prior, GENERAL_SHARE)
+    return general if _of_a_lens(general, prior) else best
+
+
+def _of_a_lens(end: Ascent, prior: Vector) -> bool:
+    """Whether an ascent ended at a lens, rather than where all edges fall onto one pixel."""
+    return bool((np.abs(end.deviation[list(LENS)]) <= FARTHEST * prior[list(LENS)]).all())
+
+
+def independent_share(level: AssumedEdges, deviation: Vector) -> float:
+    """κ, the share of the range edges that is independent, at a deviation (13,); see the top of this module.
+
+    The gradient of z scatters between frames and between sectors of the image. If all edges were independent, κ would
+    be one. Frames of one view agree with each other, but their sectors do not: the smaller share of both counts. It is
+    measured by turns, which move all edges about alike; a shift moves the nearest by most.
+    """
+    edges = level.at(deviation, TURNS)
+    axes = inverse_root(CURVATURE_PX2 * metric(edges, len(edges.weight)))
+    jacobian = np.einsum("eik,kn->ein", edges.jacobian, axes.astype(np.float32))
+    edges = DisplacedEdges(edges.uv_px, jacobian, edges.weight, edges.first_point, edges.maps)
+    z, _ = edges.significance(np.zeros(len(TURNS)))
+    seen = edges.uv_px[:, 0] >= 0.0
+    cell = np.zeros(len(seen), np.uint8)
+    cell[seen] = sectors(edges.uv_px[seen].astype(np.float64))
+    curvature = float(negative_hessian(edges, STEP_PX * sqrt(CURVATURE_PX2)).trace())
+    gradients = edges.gradients(cell, COLUMNS * ROWS)
+    shares = []
+    for groups in (gradients.sum(axis=2), gradients.sum(axis=1)):
+        count = groups.shape[1]
+        if count < 3 or z <= 0.0:
+            continue
+        centred = groups - groups.mean(axis=1)[:, None]
+        scatter = float(np.sum(centred * centred)) * count / (count - 1)
+        # The curvature is that of z²/2, and its gradient is z times that of z.
+        shares.append(curvature / max(z * z * scatter, LEAST_SQUARE))
+    if not shares or min(shares) <= 0.0:
+        raise ValueError("the edges in view do not determine how independent they are")
+    return float(min(1.0, *shares))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fitted:
+    name: str
+    deviation: Vector
+    covariance: NDArray[np.float64]
+    significance: float
+    log_posterior: float
+    log_evidence: float
+
+
+DROP = 2.0
+"""Drop of the log-posterior at which its width is measured: two standard deviations of a Gaussian."""
+
+NEAREST, WIDER, WIDENINGS = 2.0, 1.7, 6
+"""A profile is followed from this many standard deviations by the curvature, in at most so many steps."""
+
+
+def _fitted(
+    name: str,
+    levels: Sequence[AssumedEdges],
+    places: tuple[int, ...],
+    prior: Vector,
+    general: Vector,
+    share: float,
+) -> _Fitted:
+    """The maximum of a hypothesis, its covariance and its evidence. Ascents begin at what was assumed and at the
+    optimum of the general hypothesis."""
+    ends = [ascent(levels[-1:] if name == NOMINAL else levels[-2:], np.zeros(SIZE), places, prior, share)]
+    if name != NOMINAL:
+        admissible = np.abs(general) <= 4.0 * prior
+        ends.append(ascent(levels[-1:], np.where(admissible, general, 0.0), places, prior, share))
+    best = max(ends, key=lambda end: end.log_posterior)
+    return _about(name, best, levels[-1], places, prior, share)
+
+
+SAME_MODE = 3.0
+"""A maximum within this many standard deviations of another is the same mode."""
+
+
+def _other_mode(
+    nominal: _Fitted,
+    levels: Sequence[AssumedEdges],
+    places: tuple[int, ...],
+    prior: Vector,
+    general: Vector,
+    share: float,
+) -> list[_Fitted]:
+    """The nominal hypothesis about the pose of the general optimum, if that is another mode of it."""
+    start = np.zeros(SIZE)
+    start[: SHIFTS.stop] = general[: SHIFTS.stop]
+    end = ascent(levels[-2:], start, places, prior, share)
+    sigma = np.sqrt(nominal.covariance.diagonal()[list(places)])
+    away = (end.deviation - nominal.deviation)[list(places)] / sigma
+    if float(np.max(np.abs(away))) < SAME_MODE:
+        return []
+    # As wide as the mode that was found: edges that fit nothing are wide, and are no mode.
+    evidence = nominal.log_evidence + end.log_posterior - nominal.log_posterior
+    return [
+        replace(nominal, name=OTHER_MODE, deviation=end.deviation, significance=end.significance, log_evidence=evidence)
+    ]
+
+
+def _about(
+    name: str, best: Ascent, level: AssumedEdges, places: tuple[int, ...], prior: Vector, share: float
+) -> _Fitted:
+    """The covariance and the evidence of a hypothesis about its maximum."""
+    # All edges: where the profile is not Gaussian, its width depends on the directions.
+    coordinates = Coordinates.about(level, best.deviation, places, prior, share, len(level.frames.weight))
+    n = len(places)
+    off = coordinates.axes / coordinates.prior[:, None]
+    of_prior = linalg.product(off.T, off)
+    precision = share * negative_hessian(coordinates.edges, STEP_PX * sqrt(CURVATURE_PX2)) + of_prior
+    directions = inverse_root(precision)
+    widths = _profile_widths(coordinates, directions)
+    scaled = linalg.product(coordinates.axes, directions) * widths
+    covariance = np.zeros((SIZE, SIZE))
+    covariance[np.ix_(places, places)] = linalg.product(scaled, scaled.T)
+    volume = 0.5 * float(linalg.log_determinant(linalg.cholesky(linalg.product(scaled, scaled.T) + 1e-18 * np.eye(n))))
+    evidence = best.log_posterior + volume - float(np.sum(np.log(coordinates.prior)))
+    return _Fitted(name, best.deviation, covariance, best.significance, best.log_posterior, evidence)
+
+
+def _profile_widths(coordinates: Coordinates, directions: NDArray[np.float64]) -> Vector:
+    """(n,) standard deviations along n conjugate directions (columns) of unit length by the curvature, from where the
+    log-posterior has dropped by `DROP`: the root mean square of both sides."""
+    n = directions.shape[1]
+    ways = np.concatenate([directions.T, -directions.T])
+    top = float(coordinates.log_posteriors(np.zeros((1, ways.shape[1])))[0])
+    widths, walking, distance = np.empty(2 * n), np.arange(2 * n), NEAREST
+    for _ in range(WIDENINGS):
+        drops = top - coordinates.log_posteriors(distance * ways[walking])
+        # As on a parabola between the top and the first place that is low enough.
+        widths[walking] = distance * np.sqrt(DROP / np.maximum(drops, DROP))
+        walking = walking[drops < DROP]
+        if not len(walking):
+            break
+        distance *= WIDER
+    return np.asarray(np.sqrt(0.5 * (widths[:n] ** 2 + widths[n:] ** 2)) / NEAREST)
+
+
+def log_odds(probability: float) -> float:
+    """Natural logarithm of the odds of a probability; bounded at 1e-300."""
+    return log(max(probability, 1e-300)) - log(max(1.0 - probability, 1e-300))
