@@ -210,7 +210,7 @@ def posterior_of(**probabilities: float) -> Posterior:
 
 
 @pytest.mark.parametrize(
-    ("found", "refused"),
+    ("distribution", "refused"),
     [
         (posterior_of(nominal=0.01, lens_off=0.99), True),
         (posterior_of(nominal=0.4, lens_off=0.3, focal_length_off=0.3), True),
@@ -219,8 +219,8 @@ def posterior_of(**probabilities: float) -> Posterior:
     ],
     ids=["another lens", "a lens that is off one way or another", "one that is not certain", "other clocks"],
 )
-def test_a_window_through_another_lens_is_refused_for_that(found: Posterior, refused: bool) -> None:
-    verdict = verdict_on(of_objective=(*OUTSTANDING, *intrinsics_metric(found, LIMITS)))
+def test_a_window_through_another_lens_is_refused_for_that(distribution: Posterior, refused: bool) -> None:
+    verdict = verdict_on(of_objective=(*OUTSTANDING, *intrinsics_metric(distribution, LIMITS)))
     assert [reason.code for reason in verdict.reasons] == ([INTRINSICS_OFF] if refused else [])
     assert verdict.shows_another_lens is refused
     if refused:

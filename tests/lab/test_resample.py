@@ -16,13 +16,13 @@ from coec.io.images import decode_bgr
 from coec_lab.experiments import resampled_statistics, resampled_windows
 from coec_lab.experiments.resampled_statistics import ResampleReport, row_of
 from coec_lab.experiments.resampled_windows import (
-    Draw,
     LensError,
     Reference,
     ResampledSolve,
     Resampling,
-    drawn,
+    Sample,
     resampled,
+    sampled,
 )
 
 
@@ -32,7 +32,7 @@ def window() -> Window:
 
 
 def test_a_seed_gives_the_same_windows_and_a_number_another(window: Window) -> None:
-    one, again, other = (drawn(window, True, np.random.default_rng([1, number])) for number in (3, 3, 4))
+    one, again, other = (sampled(window, True, np.random.default_rng([1, number])) for number in (3, 3, 4))
     assert one == again != other
     assert one.lens is not None
     assert 3 <= len(one.frames) <= len(window.pairs)
@@ -40,8 +40,8 @@ def test_a_seed_gives_the_same_windows_and_a_number_another(window: Window) -> N
 
 def test_a_part_of_half_the_size_shows_points_at_the_pixels_that_its_camera_says(window: Window) -> None:
     rig = window.rig
-    draw = Draw((1, 4), (20, 10, 120, 100), halved=True, ring_step=2, first_ring=1, lens=None)
-    small = resampled(window, draw)
+    sample = Sample((1, 4), (20, 10, 120, 100), halved=True, ring_step=2, first_ring=1, lens=None)
+    small = resampled(window, sample)
     assert [pair.stamp_ns for pair in small.pairs] == [window.pairs[k].stamp_ns for k in (1, 4)]
     assert (small.rig.camera.width, small.rig.camera.height) == (60, 50)
     point = np.array([[0.3, -0.2, 4.0]])
@@ -68,10 +68,10 @@ def test_a_lens_error_changes_one_number(window: Window) -> None:
 
 
 def a_solve(number: int, error_deg: float, sigma_deg: float, *reasons: str) -> ResampledSolve:
-    draw = Draw((0, 1, 2), (0, 0, 9, 9), halved=False, ring_step=1, first_ring=0, lens=None)
+    sample = Sample((0, 1, 2), (0, 0, 9, 9), halved=False, ring_step=1, first_ring=0, lens=None)
     error, sigma = np.full(6, np.nan), np.full(6, np.nan)
     error[:3], sigma[:3] = np.radians([error_deg, 0.0, 0.0]), np.radians(sigma_deg)
-    return ResampledSolve(number, draw, error, sigma, accepted=not reasons, reasons=reasons)
+    return ResampledSolve(number, sample, error, sigma, accepted=not reasons, reasons=reasons)
 
 
 def test_hits_wrong_results_and_standard_deviations_are_counted() -> None:

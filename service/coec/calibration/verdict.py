@@ -121,15 +121,15 @@ def repetition_metric(
     return (Metric("edges_once", independent_samples.significance, limits.min_edges_once, at_least=True),)
 
 
-def intrinsics_metric(found: posterior.Posterior | None, limits: VerdictConfig) -> tuple[Metric, ...]:
+def intrinsics_metric(distribution: posterior.Posterior | None, limits: VerdictConfig) -> tuple[Metric, ...]:
     """How certainly another lens explains the window better than that of the rig; empty if none was tried.
 
     The logarithm of the odds as half the number of standard deviations that are worth as much, with even odds at
     `EVEN_CERTAINTY`.
     """
-    if found is None:
+    if distribution is None:
         return ()
-    nats = posterior.log_odds(found.probability(*posterior.OF_LENS))
+    nats = posterior.log_odds(distribution.probability(*posterior.OF_LENS))
     certainty = sqrt(max(EVEN_CERTAINTY**2 + 0.25 * nats, 0.0))
     return (Metric(INTRINSICS_OFF, certainty, limits.max_intrinsics_certainty, at_least=False),)
 
@@ -153,28 +153,30 @@ def optimum_metrics(
     )
 
 
-def reason_details(found: posterior.Posterior | None, moved: MovedWithin | None, window: Window) -> Mapping[str, str]:
+def reason_details(
+    distribution: posterior.Posterior | None, moved: MovedWithin | None, window: Window
+) -> Mapping[str, str]:
     """By the name of a metric, what its failure means in this window."""
     return {
-        "sigma_deg": "" if found is None else _contradictions_text(found),
-        INTRINSICS_OFF: "" if found is None else _lens_text(found, window),
+        "sigma_deg": "" if distribution is None else _contradictions_text(distribution),
+        INTRINSICS_OFF: "" if distribution is None else _lens_text(distribution, window),
         MOVED: "" if moved is None else _move_text(moved, window),
     }
 
 
-def _contradictions_text(found: posterior.Posterior) -> str:
+def _contradictions_text(distribution: posterior.Posterior) -> str:
     """Which assumptions the window contradicts, and by how much the camera turns without each."""
     turns = [
         f"estimating {_CONTRADICTED[one.name]}, too, turns it by "
         f"{degrees(float(np.linalg.norm(one.deviation[:3]))):.1f}°"
-        for one in found.hypotheses
+        for one in distribution.hypotheses
         if one.name in _CONTRADICTED and one.probability >= 0.5
     ]
     return f" ({'; '.join(turns)})" if turns else ""
 
 
-def _lens_text(found: posterior.Posterior, window: Window) -> str:
-    lens = found.of(*posterior.OF_LENS)
+def _lens_text(distribution: posterior.Posterior, window: Window) -> str:
+    lens = distribution.of(*posterior.OF_LENS)
     if lens is None:
         return ""
     (right, down, longer, _), camera = lens.lens.tolist(), window.rig.camera

@@ -29,7 +29,7 @@ COVERED_SIGMAS = 3.0
 class SolvedResample(Part):
     """One solve."""
 
-    window: Text = Field(description="number and draw of the window")
+    window: Text = Field(description="number and sample of the window")
     error: Maybe6 = Field(description="from the reference; null on axes that were not solved")
     sigma: Maybe6 = Field(description="as the estimate claims it")
     hit: bool
@@ -142,7 +142,7 @@ def lens_rows(of: Resampling, solves: Sequence[ResampledSolve]) -> list[LensRow]
 
 
 def _lens_kind(solve: ResampledSolve) -> str:
-    lens = solve.draw.lens
+    lens = solve.sample.lens
     if lens is None:
         return "right"
     bounds = (0.0, *LENS_SIZES[lens.kind], inf)
@@ -155,7 +155,7 @@ def _lens_kind(solve: ResampledSolve) -> str:
 
 def _document(solve: ResampledSolve) -> SolvedResample:
     return SolvedResample(
-        window=f"{solve.number}: {described(solve.draw)}",
+        window=f"{solve.number}: {described(solve.sample)}",
         error=finite_degrees(solve.error),
         sigma=finite_degrees(solve.sigma),
         hit=solve.hit,

@@ -136,7 +136,7 @@ class LensError:
 
 
 @dataclass(frozen=True, slots=True)
-class Draw:
+class Sample:
     """One window of a recording.
 
     Attributes:
@@ -168,7 +168,7 @@ class ResampledSolve:
     """
 
     number: int
-    draw: Draw
+    sample: Sample
     error: NDArray[np.float64]
     sigma: NDArray[np.float64]
     accepted: bool
@@ -204,7 +204,7 @@ def _raw(bgr: NDArray[np.uint8]) -> EncodedImage:
     return raw_image(ImageFormat.BGR8, width, height, np.ascontiguousarray(bgr).tobytes(), LimitsConfig())
 
 
-def drawn(window: Window, lens_errors: bool, rng: np.random.Generator) -> Draw:
+def sampled(window: Window, lens_errors: bool, rng: np.random.Generator) -> Sample:
     """A window out of another one."""
     available, camera = len(window.pairs), window.rig.camera
     count = int(rng.integers(min(LEAST_FRAMES, available), available + 1))
@@ -224,41 +224,41 @@ def drawn(window: Window, lens_errors: bool, rng: np.random.Generator) -> Draw:
     halved = bool(rng.random() < 0.25) and part[3] >= 2 * LEAST_HALVED_PX
     step = int(rng.choice(RING_STEPS))
     first = int(rng.integers(step))
-    return Draw(frames, part, halved, step, first, _drawn_lens(rng) if lens_errors else None)
+    return Sample(frames, part, halved, step, first, _sampled_lens(rng) if lens_errors else None)
 
 
-def _drawn_lens(rng: np.random.Generator) -> LensError:
+def _sampled_lens(rng: np.random.Generator) -> LensError:
     kinds: tuple[Literal["cx", "cy", "f"], ...] = ("cx", "cy", "f")
     kind = kinds[int(rng.integers(3))]
     least, most = LENS_FOCAL if kind == "f" else LENS_SHIFT_PX
     return LensError(kind, float(np.exp(rng.uniform(log(least), log(most))) * rng.choice([-1.0, 1.0])))
 
 
-def resampled(window: Window, draw: Draw) -> Window:
+def resampled(window: Window, sample: Sample) -> Window:
     """The window that was drawn out of a window of raw images."""
-    rig, (left, top, width, height) = window.rig, draw.part
+    rig, (left, top, width, height) = window.rig, sample.part
     camera = cameras.cropped(rig.camera, left, top, width, height)
     mask = None if rig.mask is None else rig.mask[top : top + height, left : left + width]
-    if draw.halved:
+    if sample.halved:
         camera = cameras.scaled(camera, 0.5, 0.5)
         mask = None if mask is None else mask[::2, ::2][: camera.height, : camera.width]
-    if draw.lens is not None:
-        camera = draw.lens.applied(camera)
+    if sample.lens is not None:
+        camera = sample.lens.applied(camera)
     pairs = tuple(
         replace(
             window.pairs[index],
-            camera=_part(window.pairs[index].camera, draw, camera.width, camera.height, rig),
-            lidar=_with_fewer_rings(window.pairs[index].lidar, draw),
+            camera=_part(window.pairs[index].camera, sample, camera.width, camera.height, rig),
+            lidar=_with_fewer_rings(window.pairs[index].lidar, sample),
         )
-        for index in draw.frames
+        for index in sample.frames
     )
     return replace(window, rig=replace(rig, camera=camera, mask=mask), pairs=pairs, between=())
 
 
-def _part(frame: CameraFrame, draw: Draw, width: int, height: int, rig: Rig) -> CameraFrame:
-    left, top, columns, rows = draw.part
+def _part(frame: CameraFrame, sample: Sample, width: int, height: int, rig: Rig) -> CameraFrame:
+    left, top, columns, rows = sample.part
     bgr = decode_bgr(frame.image, LimitsConfig())[top : top + rows, left : left + columns]
-    if draw.halved:
+    if sample.halved:
         bgr = cv2.resize(bgr, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
     depth = frame.depth
     if depth is not None:
@@ -273,17 +273,17 @@ def _part(frame: CameraFrame, draw: Draw, width: int, height: int, rig: Rig) -> 
     return replace(frame, image=_raw(bgr), depth=depth)
 
 
-def _with_fewer_rings(sweep: LidarFrame, draw: Draw) -> LidarFrame:
-    if draw.ring_step == 1:
+def _with_fewer_rings(sweep: LidarFrame, sample: Sample) -> LidarFrame:
+    if sample.ring_step == 1:
         return sweep
     ring = np.floor(bearings(sweep.xyz_m).elevation / RING_RAD) if sweep.ring is None else sweep.ring
-    chosen = np.flatnonzero(ring % draw.ring_step == draw.first_ring)
+    selected = np.flatnonzero(ring % sample.ring_step == sample.first_ring)
     return replace(
         sweep,
-        xyz_m=sweep.xyz_m[chosen],
-        intensity=None if sweep.intensity is None else sweep.intensity[chosen],
-        ring=None if sweep.ring is None else sweep.ring[chosen],
-        time_offset_s=None if sweep.time_offset_s is None else sweep.time_offset_s[chosen],
+        xyz_m=sweep.xyz_m[selected],
+        intensity=None if sweep.intensity is None else sweep.intensity[selected],
+        ring=None if sweep.ring is None else sweep.ring[selected],
+        time_offset_s=None if sweep.time_offset_s is None else sweep.time_offset_s[selected],
     )
 
 
@@ -312,15 +312,15 @@ def solve_resampled(task: tuple[int, Resampling, Reference]) -> list[ResampledSo
     number, of, reference = task
     rng = np.random.default_rng([of.seed, zlib.crc32(of.source.encode()), number])
     whole = _loaded(of.source)
-    draw = drawn(whole, of.lens_errors, rng)
-    window, configuration = resampled(whole, draw), of.configuration()
+    sample = sampled(whole, of.lens_errors, rng)
+    window, configuration = resampled(whole, sample), of.configuration()
     depth = CachedDepth(open_depth(configuration.depth, LimitsConfig()), len(window.pairs))
     shift_m = of.translation_m if of.dof == 6 else 0.0
     solves = []
     for _ in range(of.starts):
         moved = np.concatenate([radians(of.rotation_deg) * random_direction(rng), shift_m * random_direction(rng)])
         estimate = _solved(window, se3.perturb(reference.T_camera_lidar, moved), depth, configuration)
-        solves.append(_scored(number, draw, estimate, reference.T_camera_lidar))
+        solves.append(_scored(number, sample, estimate, reference.T_camera_lidar))
     return solves
 
 
@@ -332,23 +332,23 @@ def _solved(window: Window, start: Matrix4, depth: CachedDepth, configuration: C
         return None
 
 
-def _scored(number: int, draw: Draw, estimate: Estimate | None, reference: Matrix4) -> ResampledSolve:
+def _scored(number: int, sample: Sample, estimate: Estimate | None, reference: Matrix4) -> ResampledSolve:
     if estimate is None:
         unknown = np.full(6, np.nan)
-        return ResampledSolve(number, draw, unknown, unknown, accepted=False, reasons=("not_solved",))
+        return ResampledSolve(number, sample, unknown, unknown, accepted=False, reasons=("not_solved",))
     error = se3.difference(estimate.optimum.T_camera_lidar, reference)
     # Axes that stayed at the start are no result.
     error[~estimate.solved] = np.nan
     accepted = estimate.verdict.decision is Decision.ACCEPTED
     reasons = tuple(reason.code for reason in estimate.verdict.reasons)
-    return ResampledSolve(number, draw, error, estimate.sigma, accepted, reasons)
+    return ResampledSolve(number, sample, error, estimate.sigma, accepted, reasons)
 
 
-def described(draw: Draw) -> str:
-    """A draw for people."""
-    left, top, width, height = draw.part
-    lens = "" if draw.lens is None else f", {draw.lens.kind} {draw.lens.size:+.3g}"
+def described(sample: Sample) -> str:
+    """A sample for people."""
+    left, top, width, height = sample.part
+    lens = "" if sample.lens is None else f", {sample.lens.kind} {sample.lens.size:+.3g}"
     return (
-        f"frames {' '.join(map(str, draw.frames))}, {width}x{height} at {left},{top}"
-        f"{' halved' if draw.halved else ''}, rings {draw.first_ring}::{draw.ring_step}{lens}"
+        f"frames {' '.join(map(str, sample.frames))}, {width}x{height} at {left},{top}"
+        f"{' halved' if sample.halved else ''}, rings {sample.first_ring}::{sample.ring_step}{lens}"
     )

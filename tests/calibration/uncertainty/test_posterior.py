@@ -98,7 +98,7 @@ def test_another_lens_is_seen_and_reported(
 
 @pytest.mark.fault("intrinsics of another camera, a crop or a scale", "the window says so, with the size")
 @pytest.mark.parametrize("deviation", [(-0.07, 0.0, 0.0), (0.04, 0.06, 0.0), (0.0, 0.0, 0.25), (0.0, 0.0, -0.2)])
-def test_a_grossly_wrong_lens_is_found_from_the_pose_that_it_led_to(
+def test_a_grossly_wrong_lens_is_reported_from_the_pose_that_it_led_to(
     deviation: tuple[float, float, float], rng: np.random.Generator
 ) -> None:
     points, (right, down, longer) = corner_points(rng), deviation
@@ -209,7 +209,7 @@ def test_frames_in_another_order_give_the_same_posterior(rng: np.random.Generato
     )
 
 
-def test_frames_that_repeat_one_view_are_worth_one(rng: np.random.Generator) -> None:
+def test_frames_that_repeat_one_view_have_few_independent_edges(rng: np.random.Generator) -> None:
     """The share of independent edges falls as the view is repeated, so that σ does not."""
     (view, *_), still = corner_points(rng), corner_motions(speed=0.0)
     seen = corner_pixels([view])[0] + rng.normal(0.0, 1.0, (len(view), 2))

@@ -201,7 +201,7 @@ def _quasi_newton(coordinates: Coordinates, tolerance: float) -> tuple[Vector, f
 
 STEP_PX = 0.5
 """Difference step of curvatures, root mean square of the edges. With a step of a pixel the differences reach over the
-rim of a sharp hill."""
+rim of a sharp hill. See docs/measured.md."""
 
 
 def negative_hessian(edges: DisplacedEdges, step: float) -> NDArray[np.float64]:

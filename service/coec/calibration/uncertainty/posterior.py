@@ -154,8 +154,8 @@ class Posterior:
     def noise(self, moved: Sequence[int]) -> NDArray[np.float64]:
         """(n, n) covariance of the pose along n axes of ξ under the nominal hypothesis, with all else known."""
         covariance, axes = self.hypotheses[0].covariance, list(moved)
-        beside, follow = self._conditional(axes)
-        among = covariance[np.ix_(axes, axes)] - linalg.product(covariance[np.ix_(axes, beside)], follow)
+        others, regression = self._conditional(axes)
+        among = covariance[np.ix_(axes, axes)] - linalg.product(covariance[np.ix_(axes, others)], regression)
         return np.asarray(0.5 * (among + among.T))
 
     def shifts(self, moved: Sequence[int]) -> dict[str, Vector]:
@@ -165,10 +165,10 @@ class Posterior:
         its pose is from the one that was found, by the root of its probability: the root mean square of a mixture.
         """
         nominal, axes = self.hypotheses[0], list(moved)
-        beside, follow = self._conditional(axes)
-        factor = linalg.cholesky(nominal.covariance[np.ix_(beside, beside)])
-        columns = linalg.product(follow.T, factor)
-        shifts = {NAMES[place]: _at(axes, column) for place, column in zip(beside, columns.T, strict=True)}
+        others, regression = self._conditional(axes)
+        factor = linalg.cholesky(nominal.covariance[np.ix_(others, others)])
+        columns = linalg.product(regression.T, factor)
+        shifts = {NAMES[place]: _at(axes, column) for place, column in zip(others, columns.T, strict=True)}
         for one in self.hypotheses:
             shifts[one.name] = _at(axes, sqrt(one.probability) * one.deviation[axes])
         return shifts
@@ -176,9 +176,9 @@ class Posterior:
     def _conditional(self, axes: list[int]) -> tuple[list[int], NDArray[np.float64]]:
         """The m places of a deviation beside the axes of the pose, and (m, n) how these follow them."""
         covariance = self.hypotheses[0].covariance
-        beside = [place for place in NAMES if place not in axes and covariance[place, place] > 0.0]
-        among = linalg.cholesky(covariance[np.ix_(beside, beside)])
-        return beside, linalg.cholesky_solve(among, covariance[np.ix_(beside, axes)])
+        others = [place for place in NAMES if place not in axes and covariance[place, place] > 0.0]
+        among = linalg.cholesky(covariance[np.ix_(others, others)])
+        return others, linalg.cholesky_solve(among, covariance[np.ix_(others, axes)])
 
 
 def _at(axes: Sequence[int], values: Vector) -> Vector:
@@ -212,19 +212,19 @@ def measure_posterior(
     try:
         general = _general_optimum(levels, places, priors)
         nominal = ascent(levels[-1:], np.zeros(SIZE), places, priors[NOMINAL], GENERAL_SHARE)
-        fits = nominal.significance >= AS_GOOD * general.significance
-        share = independent_share(levels[-1], (nominal if fits else general).deviation)
-        found = [_fitted(name, levels, places, prior, general.deviation, share) for name, prior in priors.items()]
-        found += _other_mode(found[0], levels, places, priors[NOMINAL], general.deviation, share)
+        as_good = nominal.significance >= AS_GOOD * general.significance
+        share = independent_share(levels[-1], (nominal if as_good else general).deviation)
+        fits = [_fitted(name, levels, places, prior, general.deviation, share) for name, prior in priors.items()]
+        fits += _other_mode(fits[0], levels, places, priors[NOMINAL], general.deviation, share)
     except ValueError:
         return None
-    evidence = np.array([log(ODDS[one.name]) + one.log_evidence for one in found])
+    evidence = np.array([log(ODDS[one.name]) + one.log_evidence for one in fits])
     weights = np.exp(evidence - evidence.max())
     total = fsum(weights.tolist())
     return Posterior(
         tuple(
             Hypothesis(one.name, float(weight) / total, one.deviation, one.covariance, one.significance)
-            for one, weight in zip(found, weights, strict=True)
+            for one, weight in zip(fits, weights, strict=True)
         ),
         share,
     )
@@ -255,7 +255,7 @@ def _priors(
 
 
 ZOOMS = (-0.3, -0.18, -0.09, 0.0, 0.09, 0.18, 0.3, 0.42)
-ASIDE = (-0.1, -0.05, 0.0, 0.05, 0.1)
+OFFSETS = (-0.1, -0.05, 0.0, 0.05, 0.1)
 """Focal lengths, and places of the principal point, at which ascents of the general hypothesis may begin: about as far
 apart as the coarsest edges lead."""
 
@@ -264,11 +264,12 @@ ASCENTS = 3
 focal length climbs the coarsest edges."""
 
 GENERAL_SHARE = 0.15
-"""The share of independent edges where it is not known yet: it only weighs the priors of the general hypothesis."""
+"""The share of independent edges where it is not known yet: it only weighs the priors of the general hypothesis.
+See docs/measured.md."""
 
 
 FARTHEST = 5.0
-"""How many standard deviations of its prior a lens may be off."""
+"""How many standard deviations of its prior a lens may be off. See docs/measured.md."""
 
 AS_GOOD = 0.95
 """Where the nominal hypothesis is this good, the share of independent edges is measured at its optimum: that of the
@@ -284,14 +285,14 @@ def _general_optimum(levels: Sequence[AssumedEdges], places: tuple[int, ...], pr
     answer = linalg.product(linalg.inverse(of_coarse[:3, :3]), of_coarse[:3, 3:])
     begins = []
     for longer in ZOOMS:
-        lenses = np.array([(right, down, longer) for right, down in product(ASIDE, ASIDE)])
+        lenses = np.array([(right, down, longer) for right, down in product(OFFSETS, OFFSETS)])
         starts = np.concatenate([-linalg.product(lenses, answer.T), lenses], axis=1)
         begin = np.zeros(SIZE)
         begin[list(turning)] = starts[np.argmax(coarse.significances(starts))]
         begins.append(begin)
-    climbed = [ascent(levels[:1], begin, turning, prior, GENERAL_SHARE) for begin in begins]
-    climbed = sorted((end for end in climbed if _of_a_lens(end, prior)), key=lambda end: -end.significance)
-    leading, begins = (*TURNS, *SHIFTS, *LENS[:3]), [np.zeros(SIZE), *(end.deviation for end in climbed[:ASCENTS])]
+    ascended = [ascent(levels[:1], begin, turning, prior, GENERAL_SHARE) for begin in begins]
+    ascended = sorted((end for end in ascended if _of_a_lens(end, prior)), key=lambda end: -end.significance)
+    leading, begins = (*TURNS, *SHIFTS, *LENS[:3]), [np.zeros(SIZE), *(end.deviation for end in ascended[:ASCENTS])]
     led = [ascent(levels[1:-1], begin, leading, prior, GENERAL_SHARE) for begin in begins]
     settled = [ascent(levels[-1:], end.deviation, leading, prior, GENERAL_SHARE) for end in led]
     settled = [end for end in settled if _of_a_lens(end, prior)]
@@ -424,11 +425,11 @@ def _profile_widths(coordinates: Coordinates, directions: NDArray[np.float64]) -
     """(n,) standard deviations along n conjugate directions (columns) of unit length by the curvature, from where the
     log-posterior has dropped by `DROP`: the root mean square of both sides."""
     n = directions.shape[1]
-    ways = np.concatenate([directions.T, -directions.T])
-    top = float(coordinates.log_posteriors(np.zeros((1, ways.shape[1])))[0])
+    both_signs = np.concatenate([directions.T, -directions.T])
+    top = float(coordinates.log_posteriors(np.zeros((1, both_signs.shape[1])))[0])
     widths, walking, distance = np.empty(2 * n), np.arange(2 * n), NEAREST
     for _ in range(WIDENINGS):
-        drops = top - coordinates.log_posteriors(distance * ways[walking])
+        drops = top - coordinates.log_posteriors(distance * both_signs[walking])
         # As on a parabola between the top and the first place that is low enough.
         widths[walking] = distance * np.sqrt(DROP / np.maximum(drops, DROP))
         walking = walking[drops < DROP]
