@@ -129,6 +129,7 @@ COMMON: Mapping[str, tuple[str, ...]] = {
     "edges.charts": (
         "_cells", "_charted_z", "_pattern_search", "moved_by", "select_separated", "unit_ball",
     ),
+    "edges.displaced_alignment": ("_sums_at", "_sums_of_cells"),
     "edges.image_edges": (
         "_eroded_by", "_gain_over", "_gradient", "_less", "_over_local_mean", "_row_sums", "_smoothed", "_stepped",
         "halved",
@@ -142,7 +143,7 @@ COMMON: Mapping[str, tuple[str, ...]] = {
 
 OF_A_LENS: Mapping[str, tuple[str, ...]] = {
     "edges.alignment": (
-        "_ascend", "_late_sums", "_nearest_pixel_z", "_smooth_sums", "_smooth_sums_of_parts", "_sums_on_each_map",
+        "_ascend", "_nearest_pixel_z", "_smooth_sums", "_smooth_sums_of_parts", "_sums_on_each_map",
     ),
     "edges.charts": ("_pixels",),
     "mutual_information": ("_count",),
