@@ -204,9 +204,7 @@ def test_what_is_no_knock_does_not_refuse(change: ChangePoint | None) -> None:
 
 def posterior_of(**probabilities: float) -> Posterior:
     """Hypotheses by name, with their probabilities."""
-    return Posterior(
-        tuple(Hypothesis(name, p, np.zeros(13), np.eye(13), 20.0) for name, p in probabilities.items()), 0.1
-    )
+    return Posterior(tuple(Hypothesis(name, p, np.zeros(13), np.eye(13)) for name, p in probabilities.items()), 0.1)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,6 @@ from coec.geometry.edges.alignment import (
     alignment_of_each,
     alignment_of_parts,
     alignments,
-    alignments_of_late,
     frame_alignment,
     significances,
     strengths_on_each_map,
@@ -131,17 +130,6 @@ def test_many_poses_at_once_are_each_by_itself() -> None:
         np.testing.assert_array_equal(at.square[number], alone.square)
         of_alone = alone.strength / np.sqrt(np.maximum(alone.square, LEAST_SQUARE))
         np.testing.assert_array_equal(at.of_single_frames[number], of_alone)
-
-
-def test_edges_that_were_seen_later_are_where_they_have_come_to() -> None:
-    frames, rng = frames_of(CAMERAS["double_sphere"], (2000, 0, 1501)), np.random.default_rng(3)
-    passing = rng.normal(scale=8.0, size=frames.xyz_m.shape).astype(np.float32)
-    share = rng.uniform(-0.5, 1.0, frames.xyz_m.shape).astype(np.float32)
-    late_s = np.array([0.03, -0.02, 0.05], np.float32)
-    come = frames.xyz_m + passing * (late_s[0] * share[0] + late_s[1] * share[1] + late_s[2] * share[2])
-    expected = frame_alignment(replace(frames, xyz_m=come), POSE).significance
-    assert alignments_of_late(frames, passing, share, late_s[None], POSE[None]).at(0).significance == expected
-    assert expected != frame_alignment(frames, POSE).significance
 
 
 def test_points_behind_the_camera_and_masked_pixels_count_for_nothing() -> None:

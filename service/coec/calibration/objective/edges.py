@@ -72,9 +72,9 @@ class EdgeCue:
     thinned: tuple[EdgeCharts, EdgeCharts]
 
     @property
-    def to_the_sharpest(self) -> tuple[EdgeFrames, EdgeFrames, EdgeFrames]:
-        """Levels that lead a climb from a few pixels away to the sharpest edges: two bands, and the sharpest edges."""
-        return self.bands[1], self.bands[0], self.sharp
+    def to_the_sharpest(self) -> tuple[EdgeFrames, ...]:
+        """Levels that lead from a few degrees away to the sharpest edges: the bands, from coarse to fine, and those."""
+        return (*reversed(self.bands), self.sharp)
 
 
 ROUNDING_RAD = radians(0.1)

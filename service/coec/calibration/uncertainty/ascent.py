@@ -36,7 +36,6 @@ ROUNDS, ITERATIONS = 3, 40
 TOLERANCE, LEADING = 0.003, 0.1
 """An ascent ends with a step below this, in its coordinates, on the sharpest edges and before."""
 
-
 METRIC_POINTS = 1_000
 """Range edges from which the coordinates of an ascent are made."""
 
@@ -75,9 +74,7 @@ class Coordinates:
         edges, of_places = level.at(at, places), prior[list(places)]
         curvature = CURVATURE_PX2 * metric(edges, points) + np.diag(1.0 / of_places**2)
         axes = inverse_root(curvature)
-        jacobian = np.einsum("eik,kn->ein", edges.jacobian, axes.astype(np.float32))
-        whitened = DisplacedEdges(edges.uv_px, jacobian, edges.weight, edges.first_point, edges.maps)
-        return cls(at, places, axes, whitened, of_places, share)
+        return cls(at, places, axes, edges.along(axes), of_places, share)
 
     def deviation(self, x: Vector) -> Vector:
         """(13,) that of coordinates x (n,)."""

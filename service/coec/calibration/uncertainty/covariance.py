@@ -290,7 +290,7 @@ def _assessed(
         independent = independent_samples_at(edges.sharp, pose)
         limits, fitted_px = config.verdict, lens_error_px(window.rig.camera_residual_px)
         lens = hypot(limits.principal_point_sigma * window.rig.camera.width, fitted_px), limits.focal_length_sigma
-        posterior = measure_posterior((*reversed(edges.bands), edges.sharp), window, pose, held, held_to_m, lens)
+        posterior = measure_posterior(edges.to_the_sharpest, window, pose, held, held_to_m, lens)
         if posterior is not None:
             uncertainty = _posterior_uncertainty(posterior, objective, pose, moved, window, independent.count)
     return AssessedOptimum(search, blind, curvature, posterior, independent, uncertainty, uncertainty.sigma)

@@ -89,7 +89,9 @@ class AssumedEdges:
             follows[:, :, axis] = (ahead - behind) / np.maximum(2.0 * step_m, 1e-9)[:, None]
             seen = seen & seen_ahead & seen_behind
         from_centre = uv_px - [camera.cx, camera.cy]
-        outward = np.sum(from_centre * from_centre, axis=1, keepdims=True) / _half_diagonal2(camera)
+        outward = np.sum(from_centre * from_centre, axis=1, keepdims=True) / (
+            0.25 * (camera.width**2 + camera.height**2)
+        )
         jacobian = np.zeros((len(uv_px), 2, len(places)), np.float32)
         for column, place in enumerate(places):
             if place in LENS:
@@ -124,10 +126,6 @@ class AssumedEdges:
             return np.broadcast_to(np.eye(3)[place - SHIFTS.start], turned_m.shape)
         passing_m = (self.passing * self.share[place - CLOCKS.start]).astype(np.float64)
         return np.asarray(np.einsum("ij,jn->ni", T[:3, :3], passing_m))
-
-
-def _half_diagonal2(camera: Camera) -> float:
-    return 0.25 * (camera.width**2 + camera.height**2)
 
 
 def _moved_by_lens(

@@ -47,7 +47,6 @@ from coec.calibration.uncertainty.displaced_edges import (
 )
 from coec.geometry import linalg
 from coec.geometry.edges.alignment import LEAST_SQUARE, EdgeFrames
-from coec.geometry.edges.displaced_alignment import DisplacedEdges
 
 NOMINAL, OTHER_MODE = "nominal", "other_mode"
 PRINCIPAL_POINT_OFF, FOCAL_LENGTH_OFF, LENS_OFF = "principal_point_off", "focal_length_off", "lens_off"
@@ -110,14 +109,12 @@ class Hypothesis:
         probability: of this among all hypotheses.
         deviation: (13,) the most probable one.
         covariance: (13, 13) of the deviation; zero at places that are not free.
-        significance: z of the edges at the deviation.
     """
 
     name: str
     probability: float
     deviation: Vector
     covariance: NDArray[np.float64]
-    significance: float
 
     @property
     def lens(self) -> Vector:
@@ -223,7 +220,7 @@ def measure_posterior(
     total = fsum(weights.tolist())
     return Posterior(
         tuple(
-            Hypothesis(one.name, float(weight) / total, one.deviation, one.covariance, one.significance)
+            Hypothesis(one.name, float(weight) / total, one.deviation, one.covariance)
             for one, weight in zip(fits, weights, strict=True)
         ),
         share,
@@ -266,7 +263,6 @@ focal length climbs the coarsest edges."""
 GENERAL_SHARE = 0.15
 """The share of independent edges where it is not known yet: it only weighs the priors of the general hypothesis.
 See docs/measured.md."""
-
 
 FARTHEST = 5.0
 """How many standard deviations of its prior a lens may be off. See docs/measured.md."""
@@ -316,9 +312,7 @@ def independent_share(level: AssumedEdges, deviation: Vector) -> float:
     measured by turns, which move all edges about alike; a shift moves the nearest by most.
     """
     edges = level.at(deviation, TURNS)
-    axes = inverse_root(CURVATURE_PX2 * metric(edges, len(edges.weight)))
-    jacobian = np.einsum("eik,kn->ein", edges.jacobian, axes.astype(np.float32))
-    edges = DisplacedEdges(edges.uv_px, jacobian, edges.weight, edges.first_point, edges.maps)
+    edges = edges.along(inverse_root(CURVATURE_PX2 * metric(edges, len(edges.weight))))
     z, _ = edges.significance(np.zeros(len(TURNS)))
     seen = edges.uv_px[:, 0] >= 0.0
     cell = np.zeros(len(seen), np.uint8)
@@ -344,7 +338,6 @@ class _Fitted:
     name: str
     deviation: Vector
     covariance: NDArray[np.float64]
-    significance: float
     log_posterior: float
     log_evidence: float
 
@@ -396,9 +389,7 @@ def _other_mode(
         return []
     # As wide as the mode that was found: edges that fit nothing are wide, and are no mode.
     evidence = nominal.log_evidence + end.log_posterior - nominal.log_posterior
-    return [
-        replace(nominal, name=OTHER_MODE, deviation=end.deviation, significance=end.significance, log_evidence=evidence)
-    ]
+    return [replace(nominal, name=OTHER_MODE, deviation=end.deviation, log_evidence=evidence)]
 
 
 def _about(
@@ -418,7 +409,7 @@ def _about(
     covariance[np.ix_(places, places)] = linalg.product(scaled, scaled.T)
     volume = 0.5 * float(linalg.log_determinant(linalg.cholesky(linalg.product(scaled, scaled.T) + 1e-18 * np.eye(n))))
     evidence = best.log_posterior + volume - float(np.sum(np.log(coordinates.prior)))
-    return _Fitted(name, best.deviation, covariance, best.significance, best.log_posterior, evidence)
+    return _Fitted(name, best.deviation, covariance, best.log_posterior, evidence)
 
 
 def _profile_widths(coordinates: Coordinates, directions: NDArray[np.float64]) -> Vector:

@@ -145,22 +145,6 @@ def strengths_on_each_map(frames: EdgeFrames, T_camera_lidar: NDArray[np.float64
     return np.asarray(_sums_on_each_map(*_arguments(frames), T_camera_lidar.astype(np.float32, order="C")))
 
 
-def alignments_of_late(
-    frames: EdgeFrames,
-    passing: NDArray[np.float32],
-    share: NDArray[np.float32],
-    late_s: NDArray[np.float32],
-    poses: NDArray[np.float64],
-) -> Alignments:
-    """The alignments at many poses (K, 4, 4), with e interpolated between pixels, of moved range edges. Edges pass at
-    `passing` (3, E) m/s and are seen later than they were placed. Their delay is the sum of their shares (3, E) of
-    three delays, s, which each pose has for itself in `late_s` (K, 3). Except for the last bits the result is that of
-    `frame_alignment` with the edges moved by as much."""
-    passing, share, late_s = (np.ascontiguousarray(each, np.float32) for each in (passing, share, late_s))
-    sums = _late_sums(*_arguments(frames), poses.astype(np.float32, order="C"), passing, share, late_s)
-    return Alignments(sums[:, :, 0], sums[:, :, 1])
-
-
 def significances(frames: EdgeFrames, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """z at many poses (K, 4, 4), with e at the nearest pixel: (K,)."""
     return np.asarray(_nearest_pixel_z(*_arguments(frames), poses.astype(np.float32)))
@@ -219,48 +203,6 @@ def _sums_on_each_map(
         f, g = task // frames, task % frames
         sums[f, g], _ = smooth_sums_of_frame(camera, pose, xyz, weight, first_point[f], first_point[f + 1], maps[g])
     return sums
-
-
-@njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _late_sums(
-    camera: Camera,
-    xyz: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    first_point: NDArray[np.int64],
-    maps: NDArray[np.int8],
-    poses: NDArray[np.float32],
-    passing: NDArray[np.float32],
-    share: NDArray[np.float32],
-    late_s: NDArray[np.float32],
-) -> NDArray[np.float64]:
-    frames = first_point.shape[0] - 1
-    sums = np.empty((poses.shape[0], frames, 2))
-    for task in prange(poses.shape[0] * frames):
-        k, f = task // frames, task % frames
-        strength, square = np.zeros(BLOCK, np.float32), np.zeros(BLOCK, np.float32)
-        edges, block, moved_m = maps[f].ravel(), _block(), np.empty((3, BLOCK), np.float32)
-        for begin in range(first_point[f], first_point[f + 1], BLOCK):
-            end = min(begin + BLOCK, first_point[f + 1])
-            _pass_by(xyz[:, begin:end], passing[:, begin:end], share[:, begin:end], late_s[k], moved_m)
-            x, y, z = moved_m[0, : end - begin], moved_m[1, : end - begin], moved_m[2, : end - begin]
-            _add(strength, square, *_between(camera, poses[k], x, y, z, weight[begin:end], edges, block))
-        sums[k, f, 0], sums[k, f, 1] = _total(strength) / STRENGTH_STEPS, _total(square)
-    return sums
-
-
-@njit(cache=True)
-def _pass_by(
-    xyz_m: NDArray[np.float32],
-    passing: NDArray[np.float32],
-    share: NDArray[np.float32],
-    late_s: NDArray[np.float32],
-    out: NDArray[np.float32],
-) -> None:
-    """Writes the points (3, n), moved by their delays, into `out` (3, at least n)."""
-    for i in range(xyz_m.shape[1]):
-        late = late_s[0] * share[0, i] + late_s[1] * share[1, i] + late_s[2] * share[2, i]
-        for axis in range(3):
-            out[axis, i] = xyz_m[axis, i] + passing[axis, i] * late
 
 
 @njit(cache=True, error_model="numpy")

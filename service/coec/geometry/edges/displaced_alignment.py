@@ -6,7 +6,7 @@ ends.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,11 @@ class DisplacedEdges:
     weight: NDArray[np.float32]
     first_point: NDArray[np.int64]
     maps: NDArray[np.int8]
+
+    def along(self, axes: NDArray[np.float64]) -> "DisplacedEdges":
+        """The same edges as a function of coordinates along `axes` (n, m), columns in the space of the parameters."""
+        jacobian = np.einsum("eik,kn->ein", self.jacobian, axes.astype(np.float32))
+        return replace(self, jacobian=jacobian)
 
     def significance(self, x: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """z at the parameters x (n,), and its gradient (n,). What leaves the view does not count in the gradient."""
