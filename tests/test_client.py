@@ -6,6 +6,7 @@ import asyncio
 import time
 from collections.abc import AsyncGenerator, Callable, Iterator
 from pathlib import Path
+from typing import cast
 
 import pytest
 import zenoh
@@ -21,6 +22,7 @@ from coec.schemas.keys import Keys
 from coec.schemas.message import to_msgpack
 from coec.schemas.replies import HealthReply
 from e2e.processes import Router
+from support.fake_worker import wait_until
 from support.router import free_port
 from support.vehicles import KEYS, PAIR, VEHICLE, serving
 
@@ -209,9 +211,14 @@ def test_rubbish_is_a_decode_error(answering: Callable[[str, Callable[[Request],
 @pytest.mark.fault("a service does not answer a program", "the error `timeout` after the time that it gave")
 def test_a_question_has_a_deadline_and_can_be_given_up(router: Router) -> None:
     unfinished: list[zenoh.Query] = []
-    with open_session(ZenohConfig(connect=(router.endpoint,)), LimitsConfig()) as session:
+    connection = ZenohConfig(connect=(router.endpoint,))
+    with open_session(connection, LimitsConfig()) as session, open_session(connection, LimitsConfig()) as other:
         key = Keys("coec", "mute").extrinsic("a")
         queryable = session.declare_queryable(key, unfinished.append, complete=True)
+        querier = other.declare_querier(key)
+        wait_until(
+            lambda: cast("zenoh.MatchingStatus", querier.matching_status).matching, "the router knows the queryable"
+        )
 
         async def requested() -> None:
             async with Vehicle("mute", connect=router.endpoint, timeout_s=PATIENCE_S) as vehicle:
