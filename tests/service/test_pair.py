@@ -97,6 +97,15 @@ def test_the_same_drive_gives_the_same_decisions(undisturbed: PairBench, bench: 
     assert timeless[0] == timeless[1]
 
 
+def test_a_reason_to_end_remains_while_the_pair_goes_on(bench: PairBench) -> None:
+    bench.drive(BEGIN_S, BEGIN_S + 60)
+    bench.answers.fail(Reason("thread_died", "The thread discovery died."))
+    bench.drive(BEGIN_S + 60, BEGIN_S + 90)
+    health = bench.answers.health_reply
+    assert health.state != "healthy"
+    assert [reason.code for reason in health.reasons].count("thread_died") == 1
+
+
 def test_pairs_are_recorded_between_those_of_a_window_a_second_separate(bench: PairBench) -> None:
     bench.drive(BEGIN_S, STEP_S)
     for window_id, stamps_ns in list(bench.recorder.stamps.items())[:2]:
@@ -367,7 +376,7 @@ def test_every_check_can_be_read_afterwards(bench: PairBench) -> None:
 
 
 @pytest.mark.fault("a monitor that cannot look", "this is reported, and nothing stays green")
-def test_a_monitor_that_cannot_observation_is_reported_and_hides_no_green(bench: PairBench) -> None:
+def test_a_monitor_that_cannot_observe_is_reported_and_hides_no_green(bench: PairBench) -> None:
     bench.drive(BEGIN_S, BEGIN_S + 60)
     assert bench.answers.health_reply.state == "healthy"
     bench.worker.fault = Reason("internal_error", "The program failed (ZeroDivisionError: division by zero).")

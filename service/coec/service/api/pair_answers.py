@@ -194,6 +194,8 @@ class PairAnswers:
         self._health: StampedReply
         self._snapshots: dict[str, SerializedReply] = {}
         self._published: dict[str, object] = {}
+        self._lock = threading.Lock()
+        self._fault: Reason | None = None
 
     def reconfigure(self, pair: PairConfig) -> None:
         """Answers by these settings from now on. For any thread."""
@@ -223,9 +225,12 @@ class PairAnswers:
         health = health_of(
             known, report, self._stream.losses(), problems_of_pair, missed, self._pair, rig, self._vehicle
         )
-        self._known, self._health = known, StampedReply(health, time.monotonic())
-        self.extrinsic_reply = extrinsic
-        self._snapshots = {"extrinsic": SerializedReply.of(extrinsic), "health": SerializedReply.of(health)}
+        with self._lock:
+            if self._fault is not None:
+                health = _failing(health, self._fault)
+            self._known, self._health = known, StampedReply(health, time.monotonic())
+            self.extrinsic_reply = extrinsic
+            self._snapshots = {"extrinsic": SerializedReply.of(extrinsic), "health": SerializedReply.of(health)}
         essences = {
             "extrinsic": extrinsic.model_copy(update={"percent_complete": 0.0}),
             "health": (health.state, tuple(map(_essence, health.reasons)), health.needs, known.solved),
@@ -237,17 +242,13 @@ class PairAnswers:
                 self._context.publish(key, self._snapshots[name].answer("msgpack"))
 
     def fail(self, reason: Reason) -> None:
-        """Reports that the service is about to end, for this reason, whatever the thread that decides is doing."""
-        reply = self._health.reply
-        health = with_problems(Health(HealthState(reply.state), ()), (reason,))
-        update = {
-            "state": health.state.value,
-            "level": replies.ROS_LEVELS[health.state.value],
-            "reasons": (*reply.reasons, *reasons_of(health.reasons)),
-        }
-        failed = reply.model_copy(update=update)
-        self._health = StampedReply(failed, time.monotonic())
-        self._snapshots = {**self._snapshots, "health": SerializedReply.of(failed)}
+        """Reports that the service is about to end, for this reason, from now on, whatever the thread that decides is
+        doing."""
+        with self._lock:
+            self._fault = reason
+            failed = _failing(self._health.reply, reason)
+            self._health = StampedReply(failed, time.monotonic())
+            self._snapshots = {**self._snapshots, "health": SerializedReply.of(failed)}
         self._context.publish(f"{self._context.keys.root}/{self.name}/health", self.health("msgpack"))
 
     # --- on any -----------------------------------------------------------------------------------------------------
@@ -387,6 +388,17 @@ class PairAnswers:
         nominal = self._context.nominal(self.name)
         losses = {**counted.losses, **nominal.losses}
         return counted.model_copy(update={"losses": losses, "found": dict(nominal.origins)})
+
+
+def _failing(reply: replies.HealthReply, reason: Reason) -> replies.HealthReply:
+    """The reply of a service that is about to end for a reason."""
+    health = with_problems(Health(HealthState(reply.state), ()), (reason,))
+    update = {
+        "state": health.state.value,
+        "level": replies.ROS_LEVELS[health.state.value],
+        "reasons": (*reply.reasons, *reasons_of(health.reasons)),
+    }
+    return reply.model_copy(update=update)
 
 
 def _essence(reason: replies.Reason) -> str:
