@@ -16,10 +16,11 @@ from coec.errors import CalibrationError
 from coec.geometry.cameras import Camera, pixel_rad, scaled
 from coec.geometry.edges.alignment import Alignment, EdgeFrames, alignments, frame_alignment, strengths_on_each_map
 from coec.geometry.edges.charts import EdgeCharts, edge_charts
-from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, EdgeScales
+from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, STRENGTH_STEPS, EdgeScales
 from coec.geometry.edges.range_edges import range_edges
 from coec.geometry.points import thinned
 from coec.geometry.projection import half_field_of_view_rad, within_cone
+from coec.geometry.sweep_kernels import bearings
 
 BANDS = 3
 """Bands of about 0.8, 0.4 and 0.2 degrees: the coarsest feels a pose 0.9 degrees away, the finest is sharp enough to
@@ -36,6 +37,16 @@ the global stage has to be finer. See docs/measured.md."""
 
 RANKED_POINTS = 60_000
 """Most range edges of the window that rank basins: bounds the time for a window of many frames."""
+
+MOST_STRENGTH = 2.0
+"""Standard deviations at which the strength of an image edge is cut off. That a range edge falls on an image edge is
+evidence, but not ten times as much because the edge stands alone before the sky: a row of range edges on the rim of a
+bridge would outweigh everything that fits at the true pose. See docs/measured.md."""
+
+CELL_RAD = radians(1.0)
+"""Side of the cells of azimuth and elevation in which range edges count as neighbours. Neighbours lie along the same
+rim, fall on the same image edge or miss it together, and so are one piece of evidence: with n in a cell each has
+1/√n of its weight. See docs/measured.md."""
 
 THINNED_POINTS = 3_000
 """Range edges of the window that score the cover; significance falls only with the square root of their number."""
@@ -138,7 +149,12 @@ def build_edges(pairs: Sequence[FramePair], points: Points, greys: Iterable[NDAr
         )
     # The shift is not compensated: motion compensation turns this tenth of a degree by two degrees at most.
     xyz_m = np.concatenate([points(frame, edges.index) + edges.shift_m for frame, edges in enumerate(detected)])
-    weight = np.concatenate([edges.weight for edges in detected])
+    weight = np.concatenate(
+        [
+            edges.weight / np.sqrt(_neighbours(pair.lidar.xyz_m[edges.index]))
+            for edges, pair in zip(detected, pairs, strict=True)
+        ]
+    ).astype(np.float32)
     finest, coarsest = _finest_level(rig.camera), _coarsest_level(rig.camera)
     finest = min(finest, coarsest + 1 - BANDS)
     sharp, whole, *of_bands = _maps(rig, finest, coarsest, greys, len(pairs))
@@ -173,6 +189,15 @@ def build_edges(pairs: Sequence[FramePair], points: Points, greys: Iterable[NDAr
     )
 
 
+def _neighbours(xyz_m: NDArray[np.float32]) -> NDArray[np.int64]:
+    """(N,) the number of points (N, 3) in the cell of each."""
+    seen = bearings(xyz_m)
+    columns = math.ceil(math.tau / CELL_RAD) + 1
+    row, column = (np.floor(angle / CELL_RAD).astype(np.int64) for angle in (seen.elevation, seen.azimuth))
+    cell = (row - row.min(initial=0)) * columns + column - column.min(initial=0)
+    return np.bincount(cell)[cell]
+
+
 def _maps(
     rig: Rig, finest: int, coarsest: int, greys: Iterable[NDArray[np.uint8]], frames: int
 ) -> list[NDArray[np.int8]]:
@@ -192,7 +217,8 @@ def _maps(
         maps = (pyramid.sharp, pyramid.whole, *pyramid.bands[-BANDS:])
         stacks = stacks or [np.empty((frames, *level.shape), np.int8) for level in maps]
         for stack, level in zip(stacks, maps, strict=True):
-            stack[frame] = level
+            # Masked pixels stay as they are: they are below every strength.
+            np.minimum(level, np.int8(MOST_STRENGTH * STRENGTH_STEPS), out=stack[frame])
     return stacks
 
 

@@ -76,12 +76,19 @@ ROUNDS = (
 its own chart, which is how the true pose is found: on a coarse chart hundreds of layouts that happen to fit may rank
 above it. See docs/measured.md."""
 
-SHIFTED_POSES, SHIFT_M = 4, 0.25
+SHIFTED_POSES, SHIFT_M = 6, 0.25
 """If translation is searched, each of this many best poses is shifted by this distance either way along each axis, and
-the six shifted poses climb again. This is needed because poses of one rotation do not count as apart, so their
-translation was chosen on the coarse chart, which hardly shows it. See docs/measured.md."""
+the shifted poses climb again. This is needed because poses of one rotation do not count as apart, so their translation
+was chosen on the coarse chart, which hardly shows it. See docs/measured.md."""
 
-SHIFTED = _Round(6 * SHIFTED_POSES, 0.0, FINE, thinned=False, points=4_000, step_rad=radians(0.15), halvings=1)
+SHIFT_TURNS = 2
+"""How often that is done, each time with the best poses so far: the translation of the cover may be two shifts off."""
+
+TURNED_FOR_M = 10.0
+"""A shift to the side or upwards is also tried with the turn that leaves things at this distance where they are in the
+image. Along this valley turns and shifts make up for each other, and a climb along single axes halts in it."""
+
+SHIFTED = _Round(10 * SHIFTED_POSES, 0.0, FINE, thinned=False, points=4_000, step_rad=radians(0.15), halvings=1)
 """How the shifted poses climb: as in the last round, with as many edges as it takes to see a quarter of a metre."""
 
 
@@ -118,10 +125,10 @@ def find_basins(edges: EdgeCue, start: Matrix4, reach: SearchBox) -> list[Basin]
         charts = thinned_to[number.chart] if number.thinned else finest
         poses = poses[_separated(poses, charted_significances(charts, poses), number.poses, number.separation_rad)]
         poses, z = _pattern_searched(charts, poses, number, start, reach)
-    if reach.translation_m > 0.0:
-        more = _shifted(poses[np.argsort(-z, kind="stable")[:SHIFTED_POSES]])
-        more, _ = _pattern_searched(finest, more, SHIFTED, start, reach)
-        poses = np.concatenate([poses, more])
+    for _ in range(SHIFT_TURNS if reach.translation_m > 0.0 else 0):
+        best = _separated(poses, z, SHIFTED_POSES, ROUNDS[-1].separation_rad)
+        more, _ = _pattern_searched(finest, _shifted(poses[best]), SHIFTED, start, reach)
+        poses, z = np.concatenate([poses, more]), np.concatenate([z, charted_significances(finest, more)])
     z = charted_significances(finest, poses)
     return [Basin(poses[k], float(z[k])) for k in _separated(poses, z, len(poses), ROUNDS[-1].separation_rad)]
 
@@ -174,11 +181,12 @@ def _promising(charts: EdgeCharts, start: Matrix4, reach: SearchBox) -> NDArray[
 
 
 def _shifted(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(6·K, 4, 4) the poses (K, 4, 4), each shifted either way along each camera axis."""
-    shifts = SHIFT_M * np.concatenate([np.eye(3), -np.eye(3)])
-    shifted = np.repeat(poses, len(shifts), axis=0)
-    shifted[:, :3, 3] += np.tile(shifts, (len(poses), 1))
-    return shifted
+    """(10·K, 4, 4) the poses (K, 4, 4), each shifted either way along each camera axis, and sideways and upwards also
+    with the turn that makes up for it."""
+    turn_rad = SHIFT_M / TURNED_FOR_M
+    x, y, z = SHIFT_M * np.eye(6)[3:]
+    one_way = np.array([x, x - turn_rad * np.eye(6)[1], y, y + turn_rad * np.eye(6)[0], z])
+    return np.array([se3.perturb(pose, step) for pose in poses for step in (*one_way, *-one_way)])
 
 
 def _pattern_searched(
