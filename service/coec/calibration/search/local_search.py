@@ -98,9 +98,14 @@ POLISH_STEPS = 4.0
 """Half-width of the box of a polish, in steps: the search that leads to a basin ends within a few steps of its
 maximum."""
 
-POLISH_METRES_PER_RADIAN = 10.0
+POLISH_METRES_PER_RADIAN = 20.0
 """Metres per radian of the first trust region of a polish. It is wider along the translations because their hill is
 wider. See docs/measured.md."""
+
+FIXATED_M = 8.0
+"""A shift of a polish to the side or upwards turns the camera, so that things at this distance stay where they are in
+the image. Turns and shifts then make up for each other along a single axis, not along a narrow valley askew between
+two, in which a search with few evaluations halts half a degree and a decimetre before the summit."""
 
 NEAR = 0.1
 """Tolerance, as a share of the difference step, of a maximum that only ranks a basin or leads to a finer level. The
@@ -180,6 +185,8 @@ def polish(
     def pose(coordinates: NDArray[np.float64]) -> Matrix4:
         perturbation = np.zeros(6)
         perturbation[moved] = coordinates
+        right_m, down_m = perturbation[3:5]
+        perturbation[:2] += down_m / FIXATED_M, -right_m / FIXATED_M
         perturbed = se3.perturb(basin, perturbation)
         return perturbed if constraint is None else constraint(perturbed)
 
