@@ -8,8 +8,10 @@ import pytest
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.objective.edges import (
     BANDS,
+    CELL_RAD,
     COARSEST_BLUR_RAD,
     MAX_PIXELS,
+    MOST_STRENGTH,
     RANKED_POINTS,
     THINNED_POINTS,
     EdgeCue,
@@ -23,7 +25,7 @@ from coec.geometry import se3
 from coec.geometry.cameras import Camera, build
 from coec.geometry.edges.alignment import EdgeFrames, significances
 from coec.geometry.edges.charts import CELLS_PER_BLUR, MAX_CHART_POINTS
-from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, VOID, EdgeScales
+from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, STRENGTH_STEPS, VOID, EdgeScales
 from coec.geometry.edges.range_edges import range_edges
 from coec.geometry.projection import project, unproject
 from coec.io.images import GreyImages
@@ -81,16 +83,17 @@ def test_levels_double_and_end_at_the_same_angle_for_any_lens(street: Window, le
         assert COARSEST_BLUR_RAD <= edges.band_blur_rad[-1] < 2.0 * COARSEST_BLUR_RAD
 
 
-def test_maps_are_those_of_the_images(sharp_street: Window, sharp_edges: EdgeCue) -> None:
+def test_maps_are_those_of_the_images_with_strong_edges_cut_off(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     rig = sharp_street.rig
     lit = rig.mask if rig.mask is not None else np.ones((rig.camera.height, rig.camera.width), np.bool_)
     scales = EdgeScales(lit, 0, BANDS - 1, rig.T_camera_lidar_nominal[:2, 2])
+    most = np.int8(MOST_STRENGTH * STRENGTH_STEPS)
     for f in (0, len(sharp_street.pairs) - 1):
         pyramid = scales.pyramid(GREY.grey(sharp_street.pairs[f].camera))
-        np.testing.assert_array_equal(sharp_edges.sharp.maps[f], pyramid.sharp)
-        np.testing.assert_array_equal(sharp_edges.whole.maps[f], pyramid.whole)
+        np.testing.assert_array_equal(sharp_edges.sharp.maps[f], np.minimum(pyramid.sharp, most))
+        np.testing.assert_array_equal(sharp_edges.whole.maps[f], np.minimum(pyramid.whole, most))
         for frames, band in zip(sharp_edges.bands, pyramid.bands, strict=True):
-            np.testing.assert_array_equal(frames.maps[f], band)
+            np.testing.assert_array_equal(frames.maps[f], np.minimum(band, most))
 
 
 def test_points_are_the_range_edges_where_they_were_at_the_exposure(sharp_street: Window, sharp_edges: EdgeCue) -> None:
@@ -100,7 +103,14 @@ def test_points_are_the_range_edges_where_they_were_at_the_exposure(sharp_street
         cloud = compensate(pair, sharp_street.rig, enabled=True)
         at_m = cloud[result.index] + result.shift_m
         np.testing.assert_array_equal(sharp_edges.sharp.xyz_m[:, first[f] : first[f + 1]].T, at_m)
-        np.testing.assert_array_equal(sharp_edges.sharp.weight[first[f] : first[f + 1]], result.weight)
+        weight = sharp_edges.sharp.weight[first[f] : first[f + 1]]
+        assert (weight <= result.weight).all()
+        # What has no neighbour within a cell's diagonal keeps its weight.
+        near = pair.lidar.xyz_m[result.index]
+        rays = near / np.linalg.norm(near, axis=1, keepdims=True)
+        alone = (rays @ rays.T > np.cos(2.0 * CELL_RAD)).sum(axis=1) == 1
+        np.testing.assert_array_equal(weight[alone], result.weight[alone])
+        assert (weight[~alone] < result.weight[~alone]).any()
 
 
 def test_charts_are_of_the_coarse_bands_with_all_of_their_points_or_some(sharp_edges: EdgeCue) -> None:

@@ -195,7 +195,7 @@ def _neighbours(xyz_m: NDArray[np.float32]) -> NDArray[np.int64]:
     columns = math.ceil(math.tau / CELL_RAD) + 1
     row, column = (np.floor(angle / CELL_RAD).astype(np.int64) for angle in (seen.elevation, seen.azimuth))
     cell = (row - row.min(initial=0)) * columns + column - column.min(initial=0)
-    return np.bincount(cell)[cell]
+    return np.asarray(np.bincount(cell)[cell])
 
 
 def _maps(
