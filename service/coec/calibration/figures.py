@@ -69,7 +69,7 @@ FIGURES: Mapping[str, DiagnosticFigure] = MappingProxyType(
             "Edges, counted once",
             "σ",
             "How significantly the LiDAR's edges lie on those of the images while the vehicle drives. What all frames "
-            "have in common is counted once.",
+            "have in common is counted once; as of ten such frames.",
             "the matched edges are the same in all frames although the vehicle drives, as lines along its road are",
             "Take a window past other objects: houses, cars, posts and trees within range of the LiDAR.",
         ),

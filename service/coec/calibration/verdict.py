@@ -110,8 +110,8 @@ def change_metric(change: ChangePoint | None, limits: VerdictConfig) -> tuple[Me
 def repetition_metric(
     independent_samples: IndependentSamples | None, pairs: Sequence[FramePair], limits: VerdictConfig
 ) -> tuple[Metric, ...]:
-    """How significant the edges are if all that frames have in common counts once; empty if no edges were used, or if
-    the vehicle is not known to drive.
+    """How significant the edges of ten such frames are if all that frames have in common counts once; empty if no edges
+    were used, or if the vehicle is not known to drive.
 
     For a standing vehicle, what stands still in its images is the whole scene. For a driving one, what stands still are
     the lines along its road, and any two of those fit each other. See docs/measured.md.

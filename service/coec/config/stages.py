@@ -158,10 +158,10 @@ class VerdictConfig(ConfigModel):
         description="largest ratio of the second-best basin's edge contrast to the best one's; above: ambiguous",
     )
     min_edges_once: float = Field(
-        default=15.0,
+        default=12.5,
         gt=0,
-        description="least edge significance of a moving vehicle, where what its frames have in common counts once; "
-        "below: guard rails may fit lane markings (fused)",
+        description="least edge significance of a moving vehicle, where what its frames have in common counts once, as "
+        "of ten frames; below: guard rails may fit lane markings (fused)",
     )
     max_change_gain: float = Field(
         default=3.5,

@@ -8,13 +8,13 @@ import pytest
 from coec.calibration.uncertainty.displaced_edges import (
     CLOCKS,
     LENS,
-    OUT_OF_VIEW_PX,
     SHIFTS,
     SIZE,
     TURNS,
     AssumedEdges,
     assumed_levels,
 )
+from coec.geometry.edges.displaced_alignment import OUT_OF_VIEW_PX
 from support.scenes import (
     CORNER_CAMERA,
     IDENTITY_POSE,
@@ -42,8 +42,8 @@ def test_the_jacobian_is_that_of_differences(level: AssumedEdges, place: int) ->
     step = np.zeros(SIZE)
     step[place] = STEPS[place]
     (ahead, behind), jacobian = (
-        [level.at(deviation + sign * step, ()).uv_px for sign in (1.0, -1.0)],
-        level.at(deviation, (place,)).jacobian[:, :, 0],
+        [level.at(deviation + sign * step, ()).uv_px.T for sign in (1.0, -1.0)],
+        level.at(deviation, (place,)).jacobian[0].T,
     )
     seen = (ahead[:, 0] > OUT_OF_VIEW_PX / 2.0) & (behind[:, 0] > OUT_OF_VIEW_PX / 2.0) & jacobian.any(axis=1)
     assert seen.sum() > 1000

@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 
 from calibration.conftest import window_of
 from coec.calibration.frames.motion_compensation import compensate
-from coec.calibration.objective.edges import EdgeCue, build_edges, effective_sample_size, independent_samples_at
+from coec.calibration.objective.edges import (
+    EdgeCue,
+    build_edges,
+    effective_sample_size,
+    independent_samples_at,
+    intraclass_correlation,
+)
 from coec.calibration.types import Window
 from coec.config import LimitsConfig
 from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
@@ -46,7 +52,7 @@ def sharp_edges_of(window: Window) -> EdgeFrames:
     ).sharp
 
 
-def test_each_place_of_a_drive_past_facades_is_a_observation(sharp_edges: EdgeCue, sharp_street: Window) -> None:
+def test_each_place_of_a_drive_past_facades_is_an_observation(sharp_edges: EdgeCue, sharp_street: Window) -> None:
     seen = independent_samples_at(sharp_edges.sharp, sharp_street.T_camera_lidar_start)
     assert 0.8 * FRAMES < seen.count <= FRAMES
 
@@ -60,10 +66,19 @@ def test_ten_frames_of_a_standing_vehicle_are_one_observation(sharp_edges: EdgeC
     assert standing.significance == pytest.approx(once.significance, rel=1e-4)
 
 
+def test_a_few_frames_are_as_significant_as_ten_of_their_kind(sharp_edges: EdgeCue, sharp_street: Window) -> None:
+    """Otherwise a limit would ask for a number of frames, not for what they show."""
+    pose = sharp_street.T_camera_lidar_start
+    ten = independent_samples_at(sharp_edges.sharp, pose).significance
+    assert independent_samples_at(selected(sharp_edges.sharp, [0, 3, 6, 8]), pose).significance == pytest.approx(
+        ten, rel=0.25
+    )
+
+
 def test_a_motorway_is_in_between() -> None:
     window = window_of(rendered_source(MOTORWAY))
     count = independent_samples_at(sharp_edges_of(window), window.T_camera_lidar_start).count
-    assert 1.2 < count < 0.6 * len(window.pairs)
+    assert 1.2 < count < 0.7 * len(window.pairs)
 
 
 @pytest.mark.parametrize("times", [2, 3])
@@ -73,7 +88,7 @@ def test_the_same_frames_again_are_no_further_observations(
     frames, pose = selected(sharp_edges.sharp, [0, 3, 6]), sharp_street.T_camera_lidar_start
     again = selected(frames, [0, 1, 2] * times)
     assert independent_samples_at(again, pose).count == pytest.approx(
-        independent_samples_at(frames, pose).count, rel=1e-9
+        independent_samples_at(frames, pose).count, rel=0.05
     )
 
 
@@ -97,7 +112,8 @@ def agreement(alike: float, own: float = 5.0) -> NDArray[np.float64]:
 
 
 def test_the_more_stands_still_the_fewer_observations() -> None:
-    counts = [effective_sample_size(agreement(alike)) for alike in np.linspace(0.0, 1.0, 21)]
+    shares = [intraclass_correlation(agreement(alike)) for alike in np.linspace(0.0, 1.0, 21)]
+    counts = [effective_sample_size(alike, FRAMES) for alike in shares]
     assert counts[0] == FRAMES
     assert counts[-1] == pytest.approx(1.0)
     assert (np.diff(counts) < 0.0).all()
@@ -105,10 +121,11 @@ def test_the_more_stands_still_the_fewer_observations() -> None:
 
 @pytest.mark.parametrize("alike", [-3.0, -0.2, 1.5])
 def test_observations_are_never_more_than_frames_nor_less_than_one(alike: float) -> None:
-    assert effective_sample_size(agreement(alike)) == (FRAMES if alike < 0.0 else 1.0)
+    count = effective_sample_size(intraclass_correlation(agreement(alike)), FRAMES)
+    assert count == (FRAMES if alike < 0.0 else 1.0)
 
 
 @pytest.mark.fault("frames that agree nowhere", "they count as one look, and no number ends the service")
 @pytest.mark.parametrize("own", [0.0, -2.0])
 def test_frames_that_do_not_agree_with_themselves_are_one_observation(own: float) -> None:
-    assert effective_sample_size(agreement(0.3, own)) == 1.0
+    assert effective_sample_size(intraclass_correlation(agreement(0.3, own)), FRAMES) == 1.0

@@ -93,7 +93,8 @@ def test_another_lens_is_seen_and_reported(
     np.testing.assert_allclose(lens.lens[:3], deviation, atol=0.003)
     assert (np.abs(lens.lens[:3] - deviation) < 4.0 * lens.lens_sigma[:3]).all()
     sigma = np.linalg.norm([one[:3] for one in result.shifts(range(6)).values()])
-    assert sigma > 0.8 * np.hypot(*deviation[:2])
+    error = se3.difference(se3.perturb(turned, result.step(range(6))), IDENTITY_POSE)[:3]
+    assert sigma > 0.8 * np.linalg.norm(error)
 
 
 @pytest.mark.fault("intrinsics of another camera, a crop or a scale", "the window says so, with the size")
@@ -153,7 +154,7 @@ def test_a_centre_that_was_held_elsewhere_is_seen_and_its_turn_reported(
     centre = result.of(CENTRE_OFF)
     assert centre is not None
     record_property("figure", f"probability {centre.probability:.3f}")
-    assert centre.probability > 0.9
+    assert centre.probability > 0.8
     np.testing.assert_allclose(centre.deviation[list(SHIFTS)], moved_m, atol=0.02)
     truth = se3.perturbation(np.array([0.0, 0.0, 0.0, *moved_m]))
     assert measured(levels, corner_motions(), truth, ALL_HELD).probability(CENTRE_OFF) < 0.1

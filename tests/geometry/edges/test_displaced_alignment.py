@@ -21,8 +21,8 @@ def edges(rng: np.random.Generator) -> DisplacedEdges:
     maps = rng.integers(-100, 100, (len(COUNTS), HEIGHT, WIDTH)).astype(np.int8)
     maps[:, 20:30, 40:50] = VOID
     return DisplacedEdges(
-        rng.uniform([-5.0, -5.0], [WIDTH + 5.0, HEIGHT + 5.0], (count, 2)).astype(np.float32),
-        rng.normal(size=(count, 2, PARAMETERS)).astype(np.float32),
+        rng.uniform([[-5.0], [-5.0]], [[WIDTH + 5.0], [HEIGHT + 5.0]], (2, count)).astype(np.float32),
+        rng.normal(size=(PARAMETERS, 2, count)).astype(np.float32),
         rng.uniform(0.5, 2.0, count).astype(np.float32),
         np.cumsum([0, *COUNTS]).astype(np.int64),
         maps,
@@ -33,7 +33,7 @@ def plain_significance(edges: DisplacedEdges, x: np.ndarray) -> float:
     strength = square = 0.0
     for frame, (first, last) in enumerate(zip(edges.first_point[:-1], edges.first_point[1:], strict=True)):
         for k in range(first, last):
-            u, v = edges.uv_px[k].astype(float) + edges.jacobian[k].astype(float) @ x
+            u, v = edges.uv_px[:, k].astype(float) + x @ edges.jacobian[:, :, k].astype(float)
             if not (0.0 <= u < WIDTH - 1 and 0.0 <= v < HEIGHT - 1):
                 continue
             column, row = int(u), int(v)
@@ -68,11 +68,21 @@ def test_the_gradient_is_that_of_differences(edges: DisplacedEdges) -> None:
 
 
 def test_the_gradients_of_cells_add_up_to_that_of_all(edges: DisplacedEdges, rng: np.random.Generator) -> None:
-    cell = rng.integers(0, 6, len(edges.weight)).astype(np.uint8)
-    of_cells = edges.gradients(cell, 6)
+    cell, x = rng.integers(0, 6, len(edges.weight)).astype(np.uint8), rng.normal(size=PARAMETERS)
+    of_cells = edges.gradients_of_cells(cell, 6, x, PARAMETERS)
     assert of_cells.shape == (PARAMETERS, len(COUNTS), 6)
     assert not of_cells[:, 1].any()
-    np.testing.assert_allclose(of_cells.sum(axis=(1, 2)), edges.significance(np.zeros(PARAMETERS))[1], rtol=1e-6)
+    np.testing.assert_allclose(of_cells.sum(axis=(1, 2)), edges.significance(x)[1], rtol=1e-3, atol=1e-3)
+    np.testing.assert_array_equal(edges.gradients_of_cells(cell, 6, x, 2), of_cells[:2])
+
+
+def test_many_points_are_as_each_of_them(edges: DisplacedEdges, rng: np.random.Generator) -> None:
+    points = rng.normal(size=(5, PARAMETERS))
+    values, gradients = edges.gradients_at(points)
+    for point, value, gradient in zip(points, values, gradients, strict=True):
+        alone, slope = edges.significance(point)
+        assert alone == value
+        np.testing.assert_array_equal(slope, gradient)
 
 
 def test_other_coordinates_are_the_same_edges(edges: DisplacedEdges, rng: np.random.Generator) -> None:

@@ -258,35 +258,42 @@ class IndependentSamples:
 
     Attributes:
         count: 1 to F.
-        significance: of the edges, with what frames have in common counted once: z·√(count / F), because z grows with
-            the root of the independent part; standard deviations.
+        significance: of the edges, with what frames have in common counted once, as it would be of `REFERENCE_FRAMES`
+            such frames; standard deviations. z grows with the root of the independent part, so that it is
+            z·√(count of so many frames / F).
     """
 
     count: float
     significance: float
 
 
+REFERENCE_FRAMES = 10
+
+
 def independent_samples_at(edges: EdgeFrames, T_camera_lidar: Matrix4) -> IndependentSamples:
     """How many independent frames put the camera at `T_camera_lidar` (4, 4), and how significantly."""
-    some = edges.of_points(thinned(len(edges.weight), EXCHANGED_POINTS))
-    count = effective_sample_size(strengths_on_each_map(some, T_camera_lidar))
+    frames, some = len(edges.maps), edges.of_points(thinned(len(edges.weight), EXCHANGED_POINTS))
+    alike = intraclass_correlation(strengths_on_each_map(some, T_camera_lidar))
     whole = frame_alignment(edges, T_camera_lidar).significance
-    return IndependentSamples(count, whole * math.sqrt(count / len(edges.maps)))
+    return IndependentSamples(
+        effective_sample_size(alike, frames),
+        whole * math.sqrt(effective_sample_size(alike, REFERENCE_FRAMES) / frames),
+    )
 
 
-def effective_sample_size(agreement: NDArray[np.float64]) -> float:
-    """The number of independent samples of F frames, from how well each sweep (rows) agrees with each image (columns),
-    (F, F). It is F over the design effect (Kish 1965) of as many repetitions,
-
-        F / (1 + (F - 1)·ρ),  ρ = mean agreement with other frames / mean agreement with the own one,
-
-    where ρ is the intraclass correlation, 0 to 1. Neither the order of the frames nor repeating all of them changes it.
-    Frames that do not agree with themselves count as one sample.
-    """
+def intraclass_correlation(agreement: NDArray[np.float64]) -> float:
+    """ρ, 0 to 1: mean agreement with other frames over mean agreement with the own one, from how well each sweep (rows)
+    agrees with each image (columns), (F, F). The order of the frames does not change it. It is 1 of a single frame, and
+    of frames that do not agree with themselves."""
     frames = len(agreement)
     own = math.fsum(np.diag(agreement).tolist())
     if own <= 0.0 or frames == 1:
         return 1.0
     others = (math.fsum(agreement.ravel().tolist()) - own) / (frames - 1)
-    alike = min(max(others / own, 0.0), 1.0)
+    return min(max(others / own, 0.0), 1.0)
+
+
+def effective_sample_size(alike: float, frames: int) -> float:
+    """The number of independent samples of F frames whose intraclass correlation is `alike`: F over the design effect
+    (Kish 1965), F / (1 + (F - 1)·ρ)."""
     return frames / (1.0 + (frames - 1) * alike)

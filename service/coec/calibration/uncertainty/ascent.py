@@ -90,23 +90,16 @@ class Coordinates:
         gradient = self.share * max(z, 0.0) * slope - np.einsum("ij,i->j", self.axes, off / self.prior)
         return value, gradient, z
 
-    def log_posteriors(self, points: NDArray[np.float64]) -> Vector:
-        """(K,) the same at K points (K, n)."""
-        off = (self.at[list(self.places)] + linalg.product(points, self.axes.T)) / self.prior
-        z = np.maximum(self.edges.significances(points), 0.0)
-        return np.asarray(0.5 * self.share * z * z - 0.5 * np.sum(off * off, axis=1))
-
 
 def metric(edges: DisplacedEdges, at_most: int = METRIC_POINTS) -> NDArray[np.float64]:
     """(n, n) mean products of how the parameters of some edges move them, px² per units, from about `at_most` edges."""
     some = thinned(len(edges.weight), at_most)
-    jacobian, weight = edges.jacobian[some].astype(np.float64), edges.weight[some].astype(np.float64)
+    jacobian, weight, uv_px = edges.jacobian[:, :, some].astype(np.float64), edges.weight[some], edges.uv_px[:, some]
     height, width = edges.maps.shape[1:]
-    inside = (edges.uv_px[some] >= 0.0).all(axis=1) & (edges.uv_px[some] < [width, height]).all(axis=1)
-    weight = np.where(inside, weight, 0.0)
+    inside = (uv_px >= 0.0).all(axis=0) & (uv_px < np.array([[width], [height]])).all(axis=0)
+    weight = np.where(inside, weight, 0.0).astype(np.float64)
     whole = max(float(weight.sum()), LEAST_SQUARE)
-    columns = jacobian.reshape(-1, jacobian.shape[2])
-    products = np.einsum("pk,pl->kl", columns * np.repeat(weight, 2)[:, None], columns) / whole
+    products = np.einsum("kie,lie->kl", jacobian * weight, jacobian) / whole
     return np.asarray(0.5 * (products + products.T))
 
 
@@ -194,18 +187,3 @@ def _quasi_newton(coordinates: Coordinates, tolerance: float) -> tuple[Vector, f
         if float(np.max(np.abs(step))) < tolerance:
             break
     return x, value, z
-
-
-STEP_PX = 0.5
-"""Difference step of curvatures, root mean square of the edges. With a step of a pixel the differences reach over the
-rim of a sharp hill. See docs/measured.md."""
-
-
-def negative_hessian(edges: DisplacedEdges, step: float) -> NDArray[np.float64]:
-    """(n, n) -∂²(z²/2)/∂x² about the point of some coordinates."""
-    n = edges.jacobian.shape[2]
-    hessian = np.empty((n, n))
-    for k, unit in enumerate(np.eye(n)):
-        (ahead, rising), (behind, falling) = (edges.significance(sign * step * unit) for sign in (1.0, -1.0))
-        hessian[k] = (behind * falling - ahead * rising) / (2.0 * step)
-    return np.asarray(0.5 * (hessian + hessian.T))

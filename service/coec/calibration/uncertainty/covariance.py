@@ -231,10 +231,11 @@ class AssessedOptimum:
     """An optimum and what the window says of it.
 
     Attributes:
-        search: where the search ended.
+        search: the search, with the mean of the posterior as its end if there is one: what maximises the objective lies
+            on one of its ripples.
         unobservable: the translations (places in ξ) that were searched but that the window does not determine. Along
             these the camera's centre is that of the start.
-        curvature: of the objective at the pose.
+        curvature: of the objective where the search ended.
         posterior: of pose, lens and clocks; None if the estimator used no edges, or they determine no pose.
         independent: how many independent frames the window is worth; None if the estimator used no edges.
         uncertainty: of the pose.
@@ -251,17 +252,16 @@ class AssessedOptimum:
 
 
 def assess_optimum(result: EstimatorResult, data: WindowData, config: CalibrationConfig) -> AssessedOptimum:
-    """The uncertainty of what an estimator found. If its posterior has another mode that is more probable, that one is
-    polished and assessed. If the window does not determine a translation, the search is finished again with the
-    camera's centre held there, and its new end is assessed."""
+    """What an estimator found, at the mean of its posterior, and the uncertainty of that. If the posterior has another
+    mode that is more probable, that one is assessed. If the window does not determine a translation, the search is
+    finished again with the camera's centre held there, and its new end is assessed."""
     start, dof, limits = data.window.T_camera_lidar_start, config.search.dof, config.verdict
     held = tuple(axis for axis in TRANSLATIONS if axis >= dof)
     optimum = _assessed(result, result.search, (), held, limits.held_translation_sigma_m, data.window, config)
     better = None if optimum.posterior is None else optimum.posterior.better_mode
     if better is not None:
-        mode = se3.perturb(optimum.search.T_camera_lidar, np.where(np.arange(6) < dof, better.deviation[:6], 0.0))
-        polished = local_search.polish(result.objective, mode, config.search, data.progress, optimum.search.evaluations)
-        search = replace(polished, stop_reason=result.search.stop_reason)
+        mode = se3.perturb(result.search.T_camera_lidar, np.where(np.arange(6) < dof, better.deviation[:6], 0.0))
+        search = replace(result.search, T_camera_lidar=mode)
         optimum = _assessed(result, search, (), held, limits.held_translation_sigma_m, data.window, config)
     blind = local_search.unobservable(optimum.curvature, optimum.sigma, dof, limits)
     if not blind:
@@ -293,4 +293,5 @@ def _assessed(
         posterior = measure_posterior(edges.to_the_sharpest, window, pose, held, held_to_m, lens)
         if posterior is not None:
             uncertainty = _posterior_uncertainty(posterior, objective, pose, moved, window, independent.count)
+            search = replace(search, T_camera_lidar=se3.perturb(pose, posterior.step(moved)))
     return AssessedOptimum(search, blind, curvature, posterior, independent, uncertainty, uncertainty.sigma)

@@ -19,9 +19,9 @@ from coec.calibration.types import Matrix4, Window
 from coec.geometry import se3
 from coec.geometry.cameras import Camera
 from coec.geometry.edges.alignment import EdgeFrames
-from coec.geometry.edges.displaced_alignment import DisplacedEdges
+from coec.geometry.edges.displaced_alignment import DisplacedEdges, linearised
 from coec.geometry.edges.image_edges import VOID
-from coec.geometry.points import lengths, thinned
+from coec.geometry.points import thinned
 from coec.geometry.projection import half_field_of_view_rad, project
 
 TURNS, SHIFTS, CLOCKS, LENS = range(3), range(3, 6), range(6, 9), range(9, 13)
@@ -33,9 +33,6 @@ lengths; the share by which the focal length is longer; and the share by which a
 
 SIZE = 13
 
-STEP_RAD = 1e-3
-"""Difference step, as a share of the range by which a point is shifted: about a pixel or less."""
-
 LEADING_POINTS, SETTLING_POINTS = 4_000, 20_000
 """Most range edges that are used on a level that leads to the next one, and on the sharpest."""
 
@@ -46,12 +43,6 @@ while a clock is late. The edge of the coarsest map is known only to some degree
 SLOWEST_MPS = 1.0
 """Below this speed a clock that is off by a tenth of a second moves nothing by more than 10 cm, and everything
 alike."""
-
-MARGIN = 0.25
-"""Range edges are followed this share of an image beyond its border. Beside the camera they move by any number of
-pixels for a small turn."""
-
-OUT_OF_VIEW_PX = -1e6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,40 +64,20 @@ class AssumedEdges:
 
     def at(self, deviation: NDArray[np.float64], places: Sequence[int]) -> DisplacedEdges:
         """The edges as a linear function of some places of a deviation (13,), about that deviation."""
-        camera, T = self._camera(deviation), se3.perturb(self.pose, deviation[: SHIFTS.stop])
-        xyz_m = self.frames.xyz_m.T.astype(np.float64) + np.einsum(
-            "k,ke,ie->ei", deviation[CLOCKS], self.share, self.passing
+        camera, pose = self._camera(deviation), se3.perturb(self.pose, deviation[: SHIFTS.stop])
+        uv_px, jacobian = linearised(
+            camera,
+            self.frames.camera,
+            pose,
+            deviation[SHIFTS],
+            self.frames.xyz_m,
+            self.passing,
+            self.share,
+            deviation[CLOCKS],
+            float(deviation[LENS[3]]),
+            tuple(places),
         )
-        p_camera = np.einsum("ij,nj->ni", T[:3, :3], xyz_m) + T[:3, 3]
-        uv_px, seen = project(camera, p_camera)
-        # A deviation first turns about the camera as assumed, and then shifts.
-        turned_m, step_m = p_camera - deviation[SHIFTS], STEP_RAD * lengths(p_camera)
-        follows = np.empty((len(uv_px), 2, 3))
-        for axis, unit in enumerate(np.eye(3)):
-            (ahead, seen_ahead), (behind, seen_behind) = (
-                project(camera, p_camera + sign * step_m[:, None] * unit) for sign in (1.0, -1.0)
-            )
-            follows[:, :, axis] = (ahead - behind) / np.maximum(2.0 * step_m, 1e-9)[:, None]
-            seen = seen & seen_ahead & seen_behind
-        from_centre = uv_px - [camera.cx, camera.cy]
-        outward = np.sum(from_centre * from_centre, axis=1, keepdims=True) / (
-            0.25 * (camera.width**2 + camera.height**2)
-        )
-        jacobian = np.zeros((len(uv_px), 2, len(places)), np.float32)
-        for column, place in enumerate(places):
-            if place in LENS:
-                jacobian[:, :, column] = _moved_by_lens(self.frames.camera, camera, from_centre, outward, place)
-            else:
-                by_m = self._moved_by(place, turned_m, T)
-                jacobian[:, :, column] = np.sum(follows * by_m[:, None, :], axis=2)
-        height, width = self.frames.maps.shape[1:]
-        size = np.array([width, height], np.float64)
-        seen = seen & (uv_px >= -MARGIN * size).all(axis=1) & (uv_px <= (1.0 + MARGIN) * size).all(axis=1)
-        displaced = uv_px + deviation[LENS[3]] * outward * from_centre
-        jacobian[~seen], displaced[~seen] = 0.0, OUT_OF_VIEW_PX
-        return DisplacedEdges(
-            displaced.astype(np.float32), jacobian, self.frames.weight, self.frames.first_point, self.frames.maps
-        )
+        return DisplacedEdges(uv_px, jacobian, self.frames.weight, self.frames.first_point, self.frames.maps)
 
     def _camera(self, deviation: NDArray[np.float64]) -> Camera:
         camera, (right, down, longer, _) = self.frames.camera, deviation[LENS].tolist()
@@ -116,29 +87,6 @@ class AssumedEdges:
             fx=camera.fx * (1.0 + longer),
             fy=camera.fy * (1.0 + longer),
         )
-
-    def _moved_by(self, place: int, turned_m: NDArray[np.float64], T: Matrix4) -> NDArray[np.float64]:
-        """(E, 3) how points move with one place of a deviation, per unit, at a pose (4, 4). `turned_m` (E, 3) are the
-        points in the camera frame, turned and not yet shifted."""
-        if place in TURNS:
-            return np.cross(np.eye(3)[place], turned_m)
-        if place in SHIFTS:
-            return np.broadcast_to(np.eye(3)[place - SHIFTS.start], turned_m.shape)
-        passing_m = (self.passing * self.share[place - CLOCKS.start]).astype(np.float64)
-        return np.asarray(np.einsum("ij,jn->ni", T[:3, :3], passing_m))
-
-
-def _moved_by_lens(
-    assumed: Camera, camera: Camera, from_centre: NDArray[np.float64], outward: NDArray[np.float64], place: int
-) -> NDArray[np.float64]:
-    """(E, 2) how pixels of a camera move with one place of the lens, in units of the deviation."""
-    if place == LENS[0]:
-        return np.broadcast_to([assumed.fx, 0.0], from_centre.shape)
-    if place == LENS[1]:
-        return np.broadcast_to([0.0, assumed.fy], from_centre.shape)
-    if place == LENS[2]:
-        return from_centre * [assumed.fx / camera.fx, assumed.fy / camera.fy]
-    return outward * from_centre
 
 
 def assumed_levels(edges: Sequence[EdgeFrames], window: Window, pose: Matrix4) -> list[AssumedEdges]:

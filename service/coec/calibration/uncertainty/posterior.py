@@ -2,15 +2,13 @@
 
 The log-likelihood of a deviation is κ·z²/2, the profile over the amplitude of the edges of that of independent standard
 deviates. Range edges are not independent: neighbours in a sweep, and frames of one view, say the same. κ is the share
-of them that is: the magnitude adjustment of a composite likelihood (Pace, Salvan, Sartori 2011), from the scatter of
-its gradient between frames and between sectors of the image, at an optimum that fits (as the variance inflation of a
-quasi-likelihood is from the most general hypothesis: Burnham, Anderson 2002, section 2.5). One number for all
-parameters, so that a few frames suffice.
+of them that is (see `gaussian`), at an optimum that fits, as the variance inflation of a quasi-likelihood is taken from
+the most general hypothesis (Burnham, Anderson 2002, section 2.5).
 
 Each hypothesis is a Gaussian prior of the deviation: all as calibrated; the lens a little or grossly off; the clocks
-off; the held centre off. Its evidence is the integral of the posterior (Laplace's approximation, with the width of
-each direction from the profile where it is not Gaussian). So a hypothesis that needs a wide prior has to fit that much
-better, and a window that does not tell two of them apart leaves both their prior odds.
+off; the held centre off. Its posterior is the Gaussian next to it, its evidence the integral of that. So a hypothesis
+that needs a wide prior has to fit that much better, and a window that does not tell two of them apart leaves both their
+prior odds.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,19 +20,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.objective.mutual_information import COLUMNS, ROWS, sectors
 from coec.calibration.types import Matrix4, Window
-from coec.calibration.uncertainty.ascent import (
-    CURVATURE_PX2,
-    STEP_PX,
-    Ascent,
-    Coordinates,
-    Vector,
-    ascent,
-    inverse_root,
-    metric,
-    negative_hessian,
-)
+from coec.calibration.uncertainty.ascent import Ascent, Vector, ascent, metric
 from coec.calibration.uncertainty.displaced_edges import (
     CLOCKS,
     LENS,
@@ -45,8 +32,9 @@ from coec.calibration.uncertainty.displaced_edges import (
     assumed_levels,
     moves,
 )
+from coec.calibration.uncertainty.gaussian import PRECISE, ROUGH, GaussianFit, fit_gaussian
 from coec.geometry import linalg
-from coec.geometry.edges.alignment import LEAST_SQUARE, EdgeFrames
+from coec.geometry.edges.alignment import EdgeFrames
 
 NOMINAL, OTHER_MODE = "nominal", "other_mode"
 PRINCIPAL_POINT_OFF, FOCAL_LENGTH_OFF, LENS_OFF = "principal_point_off", "focal_length_off", "lens_off"
@@ -155,19 +143,26 @@ class Posterior:
         among = covariance[np.ix_(axes, axes)] - linalg.product(covariance[np.ix_(axes, others)], regression)
         return np.asarray(0.5 * (among + among.T))
 
+    def step(self, moved: Sequence[int]) -> Vector:
+        """(6,) from the given pose to the mean of the nominal hypothesis, along n axes of ξ, with all else as it was
+        assumed."""
+        axes, mean = list(moved), self.hypotheses[0].deviation
+        others, regression = self._conditional(axes)
+        return _at(axes, mean[axes] - np.einsum("mn,m->n", regression, mean[others]))
+
     def shifts(self, moved: Sequence[int]) -> dict[str, Vector]:
         """By the name of each error, (6,) the shift of the pose along the axes `moved` by one standard deviation.
 
         The errors of the nominal hypothesis are the columns of a factor of its covariance. Each hypothesis adds how far
-        its pose is from the one that was found, by the root of its probability: the root mean square of a mixture.
+        its pose is from that of the nominal one, by the root of its probability: the root mean square of a mixture.
         """
-        nominal, axes = self.hypotheses[0], list(moved)
+        nominal, axes, best = self.hypotheses[0], list(moved), self.step(moved)[list(moved)]
         others, regression = self._conditional(axes)
         factor = linalg.cholesky(nominal.covariance[np.ix_(others, others)])
         columns = linalg.product(regression.T, factor)
         shifts = {NAMES[place]: _at(axes, column) for place, column in zip(others, columns.T, strict=True)}
         for one in self.hypotheses:
-            shifts[one.name] = _at(axes, sqrt(one.probability) * one.deviation[axes])
+            shifts[one.name] = _at(axes, sqrt(one.probability) * (one.deviation[axes] - best))
         return shifts
 
     def _conditional(self, axes: list[int]) -> tuple[list[int], NDArray[np.float64]]:
@@ -207,23 +202,18 @@ def measure_posterior(
     places = (*TURNS, *SHIFTS, *clocks, *LENS)
     priors = _priors(window, held, held_m, lens_sigma, moving=bool(clocks))
     try:
-        general = _general_optimum(levels, places, priors)
-        nominal = ascent(levels[-1:], np.zeros(SIZE), places, priors[NOMINAL], GENERAL_SHARE)
-        as_good = nominal.significance >= AS_GOOD * general.significance
-        share = independent_share(levels[-1], (nominal if as_good else general).deviation)
-        fits = [_fitted(name, levels, places, prior, general.deviation, share) for name, prior in priors.items()]
-        fits += _other_mode(fits[0], levels, places, priors[NOMINAL], general.deviation, share)
+        fits = _fits(levels, places, priors)
     except ValueError:
         return None
-    evidence = np.array([log(ODDS[one.name]) + one.log_evidence for one in fits])
+    evidence = np.array([log(ODDS[name]) + one.log_evidence for name, one in fits])
     weights = np.exp(evidence - evidence.max())
     total = fsum(weights.tolist())
     return Posterior(
         tuple(
-            Hypothesis(one.name, float(weight) / total, one.deviation, one.covariance)
-            for one, weight in zip(fits, weights, strict=True)
+            Hypothesis(name, float(weight) / total, one.mean, one.covariance)
+            for (name, one), weight in zip(fits, weights, strict=True)
         ),
-        share,
+        fits[0][1].independent_share,
     )
 
 
@@ -267,9 +257,10 @@ See docs/measured.md."""
 FARTHEST = 5.0
 """How many standard deviations of its prior a lens may be off. See docs/measured.md."""
 
-AS_GOOD = 0.95
-"""Where the nominal hypothesis is this good, the share of independent edges is measured at its optimum: that of the
-general one lies anywhere along its ridges."""
+AS_GOOD = 6.0
+"""Where the log-likelihood of the nominal hypothesis is at most this much below that of the general one, the share of
+independent edges is measured at its optimum: that of the general one lies anywhere along its ridges. Six parameters
+that are set free gain three by chance."""
 
 
 def _general_optimum(levels: Sequence[AssumedEdges], places: tuple[int, ...], priors: Mapping[str, Vector]) -> Ascent:
@@ -304,130 +295,58 @@ def _of_a_lens(end: Ascent, prior: Vector) -> bool:
     return bool((np.abs(end.deviation[list(LENS)]) <= FARTHEST * prior[list(LENS)]).all())
 
 
-def independent_share(level: AssumedEdges, deviation: Vector) -> float:
-    """κ, the share of the range edges that is independent, at a deviation (13,); see the top of this module.
-
-    The gradient of z scatters between frames and between sectors of the image. If all edges were independent, κ would
-    be one. Frames of one view agree with each other, but their sectors do not: the smaller share of both counts. It is
-    measured by turns, which move all edges about alike; a shift moves the nearest by most.
-    """
-    edges = level.at(deviation, TURNS)
-    edges = edges.along(inverse_root(CURVATURE_PX2 * metric(edges, len(edges.weight))))
-    z, _ = edges.significance(np.zeros(len(TURNS)))
-    seen = edges.uv_px[:, 0] >= 0.0
-    cell = np.zeros(len(seen), np.uint8)
-    cell[seen] = sectors(edges.uv_px[seen].astype(np.float64))
-    curvature = float(negative_hessian(edges, STEP_PX * sqrt(CURVATURE_PX2)).trace())
-    gradients = edges.gradients(cell, COLUMNS * ROWS)
-    shares = []
-    for groups in (gradients.sum(axis=2), gradients.sum(axis=1)):
-        count = groups.shape[1]
-        if count < 3 or z <= 0.0:
-            continue
-        centred = groups - groups.mean(axis=1)[:, None]
-        scatter = float(np.sum(centred * centred)) * count / (count - 1)
-        # The curvature is that of z²/2, and its gradient is z times that of z.
-        shares.append(curvature / max(z * z * scatter, LEAST_SQUARE))
-    if not shares or min(shares) <= 0.0:
-        raise ValueError("the edges in view do not determine how independent they are")
-    return float(min(1.0, *shares))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Fitted:
-    name: str
-    deviation: Vector
-    covariance: NDArray[np.float64]
-    log_posterior: float
-    log_evidence: float
-
-
-DROP = 2.0
-"""Drop of the log-posterior at which its width is measured: two standard deviations of a Gaussian."""
-
-NEAREST, WIDER, WIDENINGS = 2.0, 1.7, 6
-"""A profile is followed from this many standard deviations by the curvature, in at most so many steps."""
-
-
-def _fitted(
-    name: str,
-    levels: Sequence[AssumedEdges],
-    places: tuple[int, ...],
-    prior: Vector,
-    general: Vector,
-    share: float,
-) -> _Fitted:
-    """The maximum of a hypothesis, its covariance and its evidence. Ascents begin at what was assumed and at the
-    optimum of the general hypothesis."""
-    ends = [ascent(levels[-1:] if name == NOMINAL else levels[-2:], np.zeros(SIZE), places, prior, share)]
-    if name != NOMINAL:
-        admissible = np.abs(general) <= 4.0 * prior
-        ends.append(ascent(levels[-1:], np.where(admissible, general, 0.0), places, prior, share))
-    best = max(ends, key=lambda end: end.log_posterior)
-    return _about(name, best, levels[-1], places, prior, share)
-
-
 SAME_MODE = 3.0
 """A maximum within this many standard deviations of another is the same mode."""
 
+ADMISSIBLE = 4.0
+"""A hypothesis is also tried about the general optimum if that is within so many standard deviations of its prior."""
 
-def _other_mode(
-    nominal: _Fitted,
-    levels: Sequence[AssumedEdges],
-    places: tuple[int, ...],
-    prior: Vector,
-    general: Vector,
-    share: float,
-) -> list[_Fitted]:
-    """The nominal hypothesis about the pose of the general optimum, if that is another mode of it."""
+
+def _fits(
+    levels: Sequence[AssumedEdges], places: tuple[int, ...], priors: Mapping[str, Vector]
+) -> list[tuple[str, GaussianFit]]:
+    """The Gaussian of each hypothesis by its name, the nominal one first.
+
+    Raises:
+        ValueError: the edges in view determine no pose.
+    """
+    sharp, wide = levels[-1], np.max(list(priors.values()), axis=0)
+    general = _general_optimum(levels, places, priors)
+
+    def fit(start: Vector, prior: Vector, share: float | None, steps: int) -> GaussianFit:
+        guess = GENERAL_SHARE if share is None else share
+        return fit_gaussian(sharp, start, places, prior, guess, steps=steps, share_is_known=share is not None)
+
+    try:
+        nominal = fit(np.zeros(SIZE), priors[NOMINAL], None, PRECISE)
+        gain = 0.5 * GENERAL_SHARE * (general.significance**2 - nominal.significance**2)
+        fits_well = gain <= AS_GOOD
+    except ValueError:
+        fits_well = False
+    if not fits_well:
+        best = fit(general.deviation, wide, None, PRECISE)
+        nominal = fit(np.zeros(SIZE), priors[NOMINAL], best.independent_share, PRECISE)
+    share, fits = nominal.independent_share, [(NOMINAL, nominal)]
+    for name, prior in priors.items():
+        if name == NOMINAL:
+            continue
+        starts = [nominal.mean]
+        if (np.abs(general.deviation) <= ADMISSIBLE * prior).all():
+            starts.append(general.deviation)
+        ends = [ascent(levels[-1:], start, places, prior, share) for start in starts]
+        best_end = max(ends, key=lambda end: end.log_posterior)
+        fits.append((name, fit(best_end.deviation, prior, share, ROUGH)))
     start = np.zeros(SIZE)
-    start[: SHIFTS.stop] = general[: SHIFTS.stop]
-    end = ascent(levels[-2:], start, places, prior, share)
-    sigma = np.sqrt(nominal.covariance.diagonal()[list(places)])
-    away = (end.deviation - nominal.deviation)[list(places)] / sigma
-    if float(np.max(np.abs(away))) < SAME_MODE:
-        return []
-    # As wide as the mode that was found: edges that fit nothing are wide, and are no mode.
-    evidence = nominal.log_evidence + end.log_posterior - nominal.log_posterior
-    return [replace(nominal, name=OTHER_MODE, deviation=end.deviation, log_evidence=evidence)]
-
-
-def _about(
-    name: str, best: Ascent, level: AssumedEdges, places: tuple[int, ...], prior: Vector, share: float
-) -> _Fitted:
-    """The covariance and the evidence of a hypothesis about its maximum."""
-    # All edges: where the profile is not Gaussian, its width depends on the directions.
-    coordinates = Coordinates.about(level, best.deviation, places, prior, share, len(level.frames.weight))
-    n = len(places)
-    off = coordinates.axes / coordinates.prior[:, None]
-    of_prior = linalg.product(off.T, off)
-    precision = share * negative_hessian(coordinates.edges, STEP_PX * sqrt(CURVATURE_PX2)) + of_prior
-    directions = inverse_root(precision)
-    widths = _profile_widths(coordinates, directions)
-    scaled = linalg.product(coordinates.axes, directions) * widths
-    covariance = np.zeros((SIZE, SIZE))
-    covariance[np.ix_(places, places)] = linalg.product(scaled, scaled.T)
-    volume = 0.5 * float(linalg.log_determinant(linalg.cholesky(linalg.product(scaled, scaled.T) + 1e-18 * np.eye(n))))
-    evidence = best.log_posterior + volume - float(np.sum(np.log(coordinates.prior)))
-    return _Fitted(name, best.deviation, covariance, best.log_posterior, evidence)
-
-
-def _profile_widths(coordinates: Coordinates, directions: NDArray[np.float64]) -> Vector:
-    """(n,) standard deviations along n conjugate directions (columns) of unit length by the curvature, from where the
-    log-posterior has dropped by `DROP`: the root mean square of both sides."""
-    n = directions.shape[1]
-    both_signs = np.concatenate([directions.T, -directions.T])
-    top = float(coordinates.log_posteriors(np.zeros((1, both_signs.shape[1])))[0])
-    widths, walking, distance = np.empty(2 * n), np.arange(2 * n), NEAREST
-    for _ in range(WIDENINGS):
-        drops = top - coordinates.log_posteriors(distance * both_signs[walking])
-        # As on a parabola between the top and the first place that is low enough.
-        widths[walking] = distance * np.sqrt(DROP / np.maximum(drops, DROP))
-        walking = walking[drops < DROP]
-        if not len(walking):
-            break
-        distance *= WIDER
-    return np.asarray(np.sqrt(0.5 * (widths[:n] ** 2 + widths[n:] ** 2)) / NEAREST)
+    start[: SHIFTS.stop] = general.deviation[: SHIFTS.stop]
+    end = ascent(levels[-2:], start, places, priors[NOMINAL], share)
+    other = fit(end.deviation, priors[NOMINAL], share, ROUGH)
+    posed = slice(0, SHIFTS.stop)
+    away = (other.mean - nominal.mean)[posed] / np.sqrt(nominal.covariance.diagonal()[posed])
+    if float(np.max(np.abs(away))) >= SAME_MODE:
+        # As wide as the nominal mode: edges that fit nothing are wide, and are no mode.
+        evidence = nominal.log_evidence + other.log_posterior - nominal.log_posterior
+        fits.append((OTHER_MODE, replace(other, log_evidence=evidence)))
+    return fits
 
 
 def log_odds(probability: float) -> float:

@@ -129,7 +129,7 @@ COMMON: Mapping[str, tuple[str, ...]] = {
     "edges.charts": (
         "_cells", "_charted_z", "_pattern_search", "moved_by", "select_separated", "unit_ball",
     ),
-    "edges.displaced_alignment": ("_sums_at", "_sums_of_cells"),
+    "edges.displaced_alignment": ("_sums_at", "_sums_of_cells", "_linearised"),
     "edges.image_edges": (
         "_eroded_by", "_gain_over", "_gradient", "_less", "_over_local_mean", "_row_sums", "_smoothed", "_stepped",
         "halved",

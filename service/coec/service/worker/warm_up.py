@@ -30,7 +30,7 @@ from coec.errors import CalibrationError, DecodeError
 from coec.geometry.cameras import Camera, scaled
 from coec.geometry.edges import alignment
 from coec.geometry.edges.charts import charted_significances, edge_charts, pattern_search, select_separated
-from coec.geometry.edges.displaced_alignment import DisplacedEdges
+from coec.geometry.edges.displaced_alignment import DisplacedEdges, linearised
 from coec.geometry.mutual_information import BinnedFrames, information_of_each, mutual_information, share_of_pixels
 from coec.geometry.projection import project
 from coec.io.images import GreyImages, encode_jpeg
@@ -49,8 +49,9 @@ def late_kernels(camera: Camera) -> tuple[Callable[[], object], ...]:
     edges, pose = one_edge(camera), np.eye(4)
     two = np.stack([pose, pose])
     displaced = DisplacedEdges(
-        np.zeros((1, 2), np.float32), np.zeros((1, 2, 1), np.float32), edges.weight, edges.first_point, edges.maps
+        np.zeros((2, 1), np.float32), np.zeros((1, 2, 1), np.float32), edges.weight, edges.first_point, edges.maps
     )
+    still = np.zeros((3, 1), np.float32)
     charts = edge_charts(camera, edges.maps, BLUR_RAD, edges.xyz_m, edges.weight, np.zeros(1, np.int64))
     steps, reach = np.full(6, 0.01), np.array([0.01, 0.01])
     binned = _binned(camera)
@@ -58,7 +59,8 @@ def late_kernels(camera: Camera) -> tuple[Callable[[], object], ...]:
     return (
         lambda: alignment.ascend(edges, [alignment.AscentStart(pose, 0, 1)], pose[None, None]),
         lambda: displaced.significances(np.zeros((2, 1))),
-        lambda: displaced.significance(np.zeros(1)),
+        lambda: displaced.gradients_of_cells(np.zeros(1, np.uint8), 1, np.zeros(1), 1),
+        lambda: linearised(camera, camera, pose, np.zeros(3), edges.xyz_m, still, still, np.zeros(3), 0.0, (0,)),
         lambda: pattern_search(charts, two, steps, 1, pose, reach),
         lambda: charted_significances(charts, two),
         lambda: information_of_each(binned, two),
