@@ -185,7 +185,7 @@ class _Local:
     def distance(self, mean: Vector, factor: NDArray[np.float64]) -> float:
         """How far a mean (13,) is from here, in standard deviations of a covariance with this factor (n, n)."""
         off = (mean - self.at)[self.free]
-        return sqrt(max(float(np.einsum("i,i", off, linalg.cholesky_solve(factor, off[:, None])[:, 0])), 0.0))
+        return sqrt(max(float(np.sum(off * linalg.cholesky_solve(factor, off[:, None])[:, 0])), 0.0))
 
     def sample(self, mean: Vector, factor: NDArray[np.float64], directions: NDArray[np.float64]) -> _Sample:
         """Across the Gaussian about `mean` (13,), along orthogonal directions (n, n) in its rows."""
@@ -193,8 +193,8 @@ class _Local:
         along = linalg.product(directions, factor.T)
         rms_px = np.sqrt(np.maximum(linalg.squared(self.metric[None], along), 0.0))
         reach = np.maximum(SPAN, LEAST_SPAN_PX / np.maximum(rms_px, 1e-9))
-        aside = reach[:, None] * along
-        points = offset + np.concatenate([aside, -aside])
+        offsets = reach[:, None] * along
+        points = offset + np.concatenate([offsets, -offsets])
         z, slopes = self.edges.gradients_at(points)
         z = np.maximum(z, 0.0)
         slopes = z[:, None] * slopes
@@ -248,7 +248,7 @@ def _scatter(slopes: NDArray[np.float64]) -> float:
     if count < FEWEST:
         return 0.0
     centred = slopes - slopes.mean(axis=1)[:, None]
-    return float(np.sum(centred * centred)) * count / (count - 1)
+    return float(np.sum(centred * centred) * count / (count - 1))
 
 
 def _bounded_root(precision: NDArray[np.float64]) -> NDArray[np.float64]:
