@@ -54,7 +54,8 @@ FIGURES: Mapping[str, DiagnosticFigure] = MappingProxyType(
         "edge_contrast": DiagnosticFigure(
             "Edge contrast",
             "σ",
-            "How far the edge score at the result stands above that at other poses, in standard deviations of those.",
+            "How far the edge score at the result stands above that at other poses, in standard deviations of those; "
+            "of blurred and of sharp edges the smaller.",
             "the best pose does not score significantly higher than the others",
             _MORE_STRUCTURE,
         ),

@@ -44,6 +44,9 @@ ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)
 COUNTED = "range_edges"
 """The figure that counts what the frames show; it counts the same thing again for each frame that shows it."""
 
+EDGE_CONTRAST = "edge_contrast"
+"""The figure that says whether the edges fit better than at other poses."""
+
 UNCERTAIN = frozenset({"sigma_deg", "sigma_m", COUNTED})
 """Codes of reasons that a window with more scenes would remedy."""
 
@@ -134,6 +137,15 @@ def intrinsics_metric(distribution: posterior.Posterior | None, limits: VerdictC
     return (Metric(INTRINSICS_OFF, certainty, limits.max_intrinsics_certainty, at_least=False),)
 
 
+def _also_on_the_sharpest(metrics: tuple[Metric, ...], evaluation: Evaluation) -> tuple[Metric, ...]:
+    """The metrics of an objective, with the edge contrast of its basin on blurred edges, or on the sharpest ones at the
+    optimum, whichever is less: between boards and walls, blurred edges also fit where no sharp one does."""
+    sharp = evaluation.edge_contrast
+    return tuple(
+        replace(m, value=min(m.value, sharp)) if m.name == EDGE_CONTRAST and isfinite(sharp) else m for m in metrics
+    )
+
+
 def optimum_metrics(
     of_objective: tuple[Metric, ...],
     evaluation: Evaluation,
@@ -145,7 +157,9 @@ def optimum_metrics(
     """All metrics of an optimum: those of its objective, of its shape, of its edges, and of a change within the window.
     `evaluation` is that of the objective at the optimum."""
     return (
-        *counted_once(of_objective, optimum.uncertainty.independent_samples, len(pairs)),
+        *_also_on_the_sharpest(
+            counted_once(of_objective, optimum.uncertainty.independent_samples, len(pairs)), evaluation
+        ),
         *shape_metrics(evaluation, optimum.curvature, optimum.sigma, limits),
         *repetition_metric(optimum.independent, pairs, limits),
         *intrinsics_metric(optimum.posterior, limits),
@@ -168,7 +182,7 @@ def _contradictions_text(distribution: posterior.Posterior) -> str:
     """Which assumptions the window contradicts, and by how much the camera turns without each."""
     turns = [
         f"estimating {_CONTRADICTED[one.name]}, too, turns it by "
-        f"{degrees(float(np.linalg.norm(one.deviation[:3]))):.1f}°"
+        f"{degrees(float(np.linalg.norm((one.deviation - distribution.hypotheses[0].deviation)[:3]))):.1f}°"
         for one in distribution.hypotheses
         if one.name in _CONTRADICTED and one.probability >= 0.5
     ]

@@ -103,6 +103,7 @@ class FusedObjective:
             mi=depth.mi,
             overlap=depth.overlap,
             points_in_view=depth.points_in_view,
+            edge_contrast=self._of_edges.standard(edges.significance),
         )
 
     def cells(self, T_camera_lidar: Matrix4) -> mutual_information.Cells:

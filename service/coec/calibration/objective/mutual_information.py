@@ -117,6 +117,7 @@ class Evaluation:
         mi: mean of equation (1) over the frames, nats.
         overlap: points in view over the most that any pose of the box sees.
         points_in_view: number of points that entered the histograms, over all frames.
+        edge_contrast: how far the edges stand above other poses, standard deviations; NaN for an objective without.
     """
 
     score: float
@@ -124,6 +125,7 @@ class Evaluation:
     mi: float
     overlap: float
     points_in_view: int
+    edge_contrast: float = math.nan
 
 
 class Objective(Protocol):
