@@ -32,7 +32,7 @@ from coec.calibration.uncertainty.displaced_edges import (
     assumed_levels,
     moves,
 )
-from coec.calibration.uncertainty.gaussian import PRECISE, ROUGH, GaussianFit, fit_gaussian
+from coec.calibration.uncertainty.gaussian import PRECISE, ROUGH, GaussianFit, deletion_covariance, fit_gaussian
 from coec.geometry import linalg
 from coec.geometry.edges.alignment import EdgeFrames
 
@@ -299,7 +299,8 @@ SAME_MODE = 3.0
 """A maximum within this many standard deviations of another is the same mode."""
 
 ADMISSIBLE = 4.0
-"""A hypothesis is also tried about the general optimum if that is within so many standard deviations of its prior."""
+"""A hypothesis is also tried about the general optimum, as far as that is within so many standard deviations of its
+prior."""
 
 
 def _fits(
@@ -326,13 +327,14 @@ def _fits(
     if not fits_well:
         best = fit(general.deviation, wide, None, PRECISE)
         nominal = fit(np.zeros(SIZE), priors[NOMINAL], best.independent_share, PRECISE)
+    covariance = nominal.covariance + deletion_covariance(sharp, nominal, places, priors[NOMINAL])
+    nominal = replace(nominal, covariance=covariance)
     share, fits = nominal.independent_share, [(NOMINAL, nominal)]
     for name, prior in priors.items():
         if name == NOMINAL:
             continue
-        starts = [nominal.mean]
-        if (np.abs(general.deviation) <= ADMISSIBLE * prior).all():
-            starts.append(general.deviation)
+        admissible = np.abs(general.deviation) <= ADMISSIBLE * prior
+        starts = [nominal.mean, np.where(admissible, general.deviation, 0.0)]
         ends = [ascent(levels[-1:], start, places, prior, share) for start in starts]
         best_end = max(ends, key=lambda end: end.log_posterior)
         fits.append((name, fit(best_end.deviation, prior, share, ROUGH)))
