@@ -334,10 +334,11 @@ def _fits(
         if name == NOMINAL:
             continue
         admissible = np.abs(general.deviation) <= ADMISSIBLE * prior
-        starts = [nominal.mean, np.where(admissible, general.deviation, 0.0)]
-        ends = [ascent(levels[-1:], start, places, prior, share) for start in starts]
-        best_end = max(ends, key=lambda end: end.log_posterior)
-        fits.append((name, fit(best_end.deviation, prior, share, ROUGH)))
+        end = ascent(levels[-1:], np.where(admissible, general.deviation, 0.0), places, prior, share)
+        off = (nominal.mean / prior)[list(places)]
+        of_nominal = 0.5 * share * nominal.significance**2 - 0.5 * float(np.sum(off * off))
+        start = end.deviation if end.log_posterior > of_nominal else nominal.mean
+        fits.append((name, fit(start, prior, share, ROUGH)))
     start = np.zeros(SIZE)
     start[: SHIFTS.stop] = general.deviation[: SHIFTS.stop]
     end = ascent(levels[-2:], start, places, priors[NOMINAL], share)
