@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from coec.calibration.figures import FIGURES
 from coec.calibration.objective.edges import IndependentSamples
 from coec.calibration.objective.landscape import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
@@ -17,6 +18,7 @@ from coec.calibration.types import (
     EgoMotion,
     FramePair,
     Metric,
+    Reason,
     StopReason,
     Verdict,
     Window,
@@ -42,6 +44,7 @@ PEAK = Curvature(
 SHARP = np.array([6e-4, 6e-4, 1e-3, np.nan, np.nan, np.nan])
 VAGUE, UNKNOWN = 100.0 * SHARP, np.full(6, np.nan)
 FRAMES = 10
+TOLERANCE = StopReason.TOLERANCE
 SLOPE = replace(PEAK, first_derivative=PEAK.first_derivative * 100)
 PLAIN = replace(PEAK, first_derivative=PEAK.first_derivative / 100, second_derivative=PEAK.second_derivative / 100)
 OUTSTANDING = (
@@ -93,6 +96,33 @@ def test_a_metric_that_fails_says_its_value_and_its_limit() -> None:
     (reason,) = verdict_on(replace(GOOD, overlap=0.25)).reasons
     assert "0.25" in reason.text
     assert f"{LIMITS.min_overlap:g}" in reason.text
+
+
+@pytest.mark.parametrize(
+    ("sigma", "text"),
+    [
+        ([0.1, 0.73, 0.2], "yaw is only known to ±0.73°, limit 0.30°"),
+        ([0.412, 0.73, 0.2], "pitch is only known to ±0.41°, yaw to ±0.73°, limit 0.30°"),
+        ([0.1, 0.2, 0.3001], "roll is only known to ±0.3001°, limit 0.30°"),
+        ([np.nan, 0.2, 0.1], f"{FIGURES['sigma_deg'].fails}: unknown, limit 0.3°"),
+    ],
+)
+def test_a_rotation_that_is_not_known_well_enough_is_named_with_unit_and_limit(sigma: list[float], text: str) -> None:
+    radians = np.radians([*sigma, np.nan, np.nan, np.nan])
+    (reason,) = judge(shape_metrics(GOOD, PEAK, radians, LIMITS), TOLERANCE, 10.0, FRAMES, sigma=radians).reasons
+    assert reason == Reason("sigma_deg", text)
+
+
+def test_a_translation_that_is_not_known_well_enough_is_named_with_unit_and_limit() -> None:
+    searched = replace(PEAK, first_derivative=np.full(6, 0.1), second_derivative=np.full(6, 300.0))
+    sigma = np.array([*SHARP[:3], 0.02, 0.034, 0.123])
+    (reason,) = judge(shape_metrics(GOOD, searched, sigma, LIMITS), TOLERANCE, 10.0, FRAMES, sigma=sigma).reasons
+    assert reason == Reason("sigma_m", "position forward is only known to ±0.12 m, limit 0.10 m")
+
+
+def test_a_metric_that_fails_says_its_unit() -> None:
+    (reason,) = verdict_on(of_objective=(replace(OUTSTANDING[0], value=3.25),)).reasons
+    assert reason.text.endswith(": 3.25 σ, limit 6 σ")
 
 
 def test_a_saddle_is_not_a_maximum() -> None:
@@ -184,7 +214,7 @@ def test_a_knock_within_the_window_refuses_it_and_says_when() -> None:
     verdict = verdict_after(changed())
     (reason,) = verdict.reasons
     assert reason.code == "moved_within_window"
-    assert "the camera moved while the window was recorded, by 1.0° between 20.4 and 21.6 s: 9, limit" in reason.text
+    assert "the camera moved while the window was recorded, by 1.0° between 20.4 and 21.6 s: 9 σ, limit" in reason.text
 
 
 @pytest.mark.parametrize(

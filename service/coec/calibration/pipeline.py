@@ -48,7 +48,7 @@ def calibrate(
         moved = moved_within(change, result.edges, data)
     details = verdict.reason_details(optimum.posterior, moved, window)
     independent_samples, pairs = optimum.uncertainty.independent_samples, len(window.pairs)
-    judged = verdict.judge(metrics, optimum.search.stop_reason, independent_samples, pairs, details)
+    judged = verdict.judge(metrics, optimum.search.stop_reason, independent_samples, pairs, details, optimum.sigma)
     progress.step("diagnosis", 1, 1)
 
     dof, axes = config.search.dof, np.arange(6)

@@ -9,7 +9,7 @@ rig is commissioned.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from math import degrees, isfinite, radians, sqrt
+from math import degrees, inf, isfinite, isnan, radians, sqrt
 from types import MappingProxyType
 
 import numpy as np
@@ -217,21 +217,53 @@ def _newton_step(curvature: Curvature, axes: slice) -> float:
     return float(np.max(np.abs(first) / second)) if (second > 0.0).all() else float("inf")
 
 
+_NAMES = (("pitch", "yaw", "roll"), ("position right", "position down", "position forward"))
+"""Names of the turns about, and of the camera's place along, its axes."""
+
+
+def _failure_text(metric: Metric, detail: str, sigma: NDArray[np.float64] | None) -> str:
+    """What a metric beyond its limit means: with its value, its limit and their unit, for a σ by axis."""
+    unit = FIGURES[metric.name].unit
+    unit = unit if unit in ("", "°") else f" {unit}"
+    if sigma is not None and metric.name in ("sigma_deg", "sigma_m"):
+        turns = metric.name == "sigma_deg"
+        values = np.degrees(sigma[ROTATION]) if turns else sigma[TRANSLATION]
+        beyond = [
+            (name, value)
+            for name, value in zip(_NAMES[0 if turns else 1], values.tolist(), strict=True)
+            if metric.limit < value < inf
+        ]
+        if beyond:
+            verbs = ("is only known to", *["to"] * len(beyond))
+            axes = (
+                f"{name} {verb} ±{_above(value, metric.limit)}{unit}"
+                for (name, value), verb in zip(beyond, verbs, strict=False)
+            )
+            return f"{', '.join(axes)}{detail}, limit {metric.limit:.2f}{unit}"
+    value = "unknown" if isnan(metric.value) else f"{metric.value:.3g}{unit}"
+    return f"{FIGURES[metric.name].fails}{detail}: {value}, limit {metric.limit:.3g}{unit}"
+
+
+def _above(value: float, limit: float) -> str:
+    """A value with two digits after the point, or as many as it takes to read as more than its limit."""
+    digits = next((digits for digits in range(2, 6) if round(value, digits) > round(limit, 2)), 6)
+    return f"{value:.{digits}f}"
+
+
 def judge(
     metrics: tuple[Metric, ...],
     stop: StopReason,
     independent_samples: float,
     frames: int,
     details: Mapping[str, str] = MappingProxyType({}),
+    sigma: NDArray[np.float64] | None = None,
 ) -> Verdict:
     """Equation (2) over the metrics of the objective and of its optimum. If a window is too uncertain because its
     `frames` are worth few `independent_samples`, one reason more says that it needs motion past other things. `details`
-    holds, by the name of a metric, what its failure means in this window."""
+    holds, by the name of a metric, what its failure means in this window. From the standard deviations `sigma` (6,), a
+    reason names the axes that are not known well enough."""
     reasons = [
-        Reason(
-            metric.name,
-            f"{FIGURES[metric.name].fails}{details.get(metric.name, '')}: {metric.value:.3g}, limit {metric.limit:.3g}",
-        )
+        Reason(metric.name, _failure_text(metric, details.get(metric.name, ""), sigma))
         for metric in metrics
         if not metric.passed
     ]

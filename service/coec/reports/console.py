@@ -341,7 +341,9 @@ def show_verdict(result: replies.CalibrationResult) -> None:
     """Prints the decision, the reasons in words, and every figure beside its limit."""
     out.print("verdict ", styled(result.verdict.decision), sep="")
     for reason in result.verdict.reasons:
-        show(f"  {reason.code}: {reason.text}", "yellow")
+        out.print(
+            Text(f"  {plain(reason.text)}", "yellow"), Text(f" ({plain(reason.code)})", "dim"), sep="", soft_wrap=True
+        )
     show_metrics(result.metrics)
 
 
