@@ -45,6 +45,9 @@ def test_text_names_axes_verdict_and_reasons(coec: Coec) -> None:
     assert "+40.000" in outcome.out
     assert "verdict failed" in outcome.out
     assert "not to be used" in outcome.out
+    lines = outcome.out.splitlines()
+    poses = [k for k, line in enumerate(lines) if line.startswith(("T_camera_lidar", "translation x y z"))]
+    assert [lines[k - 1] for k in poses] == ["REFUSED - do not use"] * 2
     assert not outcome.err
 
 
@@ -59,6 +62,7 @@ def test_text_is_what_one_copies(coec: Coec, tmp_path: Path) -> None:
     np.testing.assert_allclose(json.loads(matrix.group()), result["matrix"], atol=1e-9)
     np.testing.assert_allclose(json.loads(quaternion.group(1)), result["quaternion_xyzw"], atol=1e-9)
     assert "objective mi, 3 degrees of freedom (rotation only), depth from stereo" in text
+    assert "REFUSED" not in text
     names = "close_ups.png, overlay_after.png, overlay_before.png, report.html, residuals.png, result.json"
     assert f"written to {tmp_path / 'out'}: {names}" in text
 

@@ -140,7 +140,9 @@ def test_what_is_not_accepted_is_refused_and_forced(coec: Coec, tmp_path: Path) 
     assert "--force" in outcome.err
     assert not file.exists()
     assert coec("export", path, "--format", "urdf", "--output", file, "--force").status == 0
-    assert "NOT ACCEPTED, exported by force: The edges are faint." in file.read_text()
+    assert "REFUSED - do not use. NOT ACCEPTED, exported by force: The edges are faint." in file.read_text()
+    document = coec("export", path, "--format", "json", "--force").document
+    assert (document["accepted"], document["objections"]) == (False, ["The edges are faint."])
 
 
 def test_a_nominal_state_is_refused(coec: Coec, tmp_path: Path) -> None:

@@ -64,6 +64,17 @@ def test_a_hostile_name_is_text(tmp_path: Path, kind: str) -> None:
     assert policy.startswith("default-src 'none'")
 
 
+@pytest.mark.parametrize("accepted", [True, False])
+def test_what_is_copied_of_a_refused_result_says_so(tmp_path: Path, accepted: bool) -> None:
+    read = Read(render(pages.calibration(tmp_path, accepted=accepted)))
+    copied = [attributes["data-copy"] or "" for tag, attributes in read.tags if "data-copy" in attributes]
+    shown = [text for text in read.text if "1.000000000" in text]
+    assert len(copied) == 3
+    assert len(shown) == 2
+    for text in (*copied, *shown):
+        assert text.startswith("# REFUSED - do not use\n") is not accepted
+
+
 def test_titles_that_are_alike_or_empty_have_places_of_their_own() -> None:
     sections = tuple(Section(title, (Text(("a",)),)) for title in ("One", "one!", "", "†", "One"))
     text = render(Page("kind", "title", (), sections))

@@ -36,6 +36,9 @@ AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 NS_PER_S = 1_000_000_000
 
+REFUSED = "REFUSED - do not use"
+"""Stands above every pose of a refused result that can be copied."""
+
 
 @dataclass(frozen=True, slots=True)
 class ExtrinsicOrigin:
@@ -100,6 +103,7 @@ class ExportedExtrinsic:
         """Comment lines for a file: the direction of its numbers in words, their uncertainty and their origin."""
         origin = self.origin
         lines = [
+            *self._objection_lines(),
             f"{origin.pair} of {origin.vehicle}: {origin.provenance}, by coec {origin.version}",
             direction,
             self._sigma_line(),
@@ -109,8 +113,6 @@ class ExportedExtrinsic:
             lines.append(
                 f"window {origin.window_id}, data until {utc(origin.data_stamp_ns)}, configuration {origin.config_hash}"
             )
-        if origin.rejection_reasons:
-            lines.append(f"NOT ACCEPTED, exported by force: {' '.join(origin.rejection_reasons)}")
         return [_one_line(line) for line in lines]
 
     def document(self, direction: str) -> dict[str, object]:
@@ -129,6 +131,14 @@ class ExportedExtrinsic:
             "config_hash": origin.config_hash,
             "version": origin.version,
         }
+
+    def _objection_lines(self) -> list[str]:
+        """Why it must not be used, in the first line; nothing for an accepted extrinsic."""
+        reasons = self.origin.rejection_reasons
+        if not reasons:
+            return []
+        refused = "" if self.origin.provenance == "nominal" else f"{REFUSED}. "
+        return [f"{refused}NOT ACCEPTED, exported by force: {' '.join(reasons)}"]
 
     def _sigma_line(self) -> str:
         sigma = np.sqrt(self.covariance.diagonal())

@@ -11,6 +11,7 @@ from coec.config import CalibrationConfig
 from coec.geometry import se3
 from coec.geometry.points import distinct_rings
 from coec.io.depth.depth_maps import STEREO
+from coec.io.exported_extrinsic import REFUSED
 from coec.reports import console, page_parts
 from coec.reports.formatting import count, number, percent, second, significant, size
 from coec.reports.page import AxesTable, Block, Facts, Page, Section, Text, VerdictBanner
@@ -50,9 +51,11 @@ def show(
     console.show(f"{window.window_id}: {count(result.pairs, 'pair')}, {result.points_in_view} points in view")
     _show_axes(window, result)
     console.show_verdict(result)
-    if result.verdict.decision != "accepted":
+    if not _accepted(result):
         console.show("what follows was not accepted: it is the best guess, and not to be used on a vehicle", "yellow")
-    show_pose(result.camera_from_lidar, result.lidar_frame, result.camera_frame)
+    show_pose(
+        result.camera_from_lidar, result.lidar_frame, result.camera_frame, warning="" if _accepted(result) else REFUSED
+    )
     console.show(settings_text(configuration, result.depth_identity))
     console.show(compensation_text(result.compensation))
     if any(pair.lidar.ring is not None and distinct_rings(pair.lidar.ring) is None for pair in window.pairs):
@@ -89,12 +92,17 @@ def start_of(window: Window) -> Vector6:
     return cast("Vector6", tuple(float(value) for value in start))
 
 
-def show_pose(camera_from_lidar: Transform, lidar_frame: str, camera_frame: str) -> None:
-    """Prints the pose in a form to copy: a matrix that Python, YAML and JSON read as it stands."""
+def show_pose(camera_from_lidar: Transform, lidar_frame: str, camera_frame: str, *, warning: str = "") -> None:
+    """Prints the pose in a form to copy: a matrix that Python, YAML and JSON read as it stands. A `warning` stands
+    above each form."""
+    if warning:
+        console.show(warning, "bold red")
     console.show(f"T_camera_lidar: p_camera = T · p_lidar, from frame {lidar_frame} to frame {camera_frame}, metres:")
     rows = [f"[{', '.join(f'{value + 0.0:.{DIGITS}f}' for value in row)}]" for row in camera_from_lidar.matrix]
     for before, row, after in zip(("[", " ", " ", " "), rows, (",", ",", ",", "]"), strict=True):
         console.show(f"  {before}{row}{after}")
+    if warning:
+        console.show(warning, "bold red")
     console.show(f"translation x y z, m: {_numbers(camera_from_lidar.translation_m)}")
     console.show(f"quaternion x y z w: {_numbers(camera_from_lidar.quaternion_xyzw)}")
 
@@ -182,7 +190,7 @@ def calibration_page(
     """
     sections = (
         Section("Result", (_axes(report, start), *(Text((each,)) for each in remarks))),
-        Section("To copy", (page_parts.copies_of(report.camera_from_lidar, report.camera_frame, report.lidar_frame),)),
+        _copies(report),
         *((Section("Pictures", tuple(pictures)),) if pictures else ()),
         Section(
             "Why it was " + ("accepted" if _accepted(report) else "refused"),
@@ -198,6 +206,14 @@ def calibration_page(
     )
     verdict = _verdict(report)
     return Page("coec calibrate", f"Calibration of {report.vehicle} / {report.pair}", (verdict,), sections)
+
+
+def _copies(report: CalibrationReport) -> Section:
+    pose = report.camera_from_lidar, report.camera_frame, report.lidar_frame
+    if _accepted(report):
+        return Section("To copy", (page_parts.copies_of(*pose),))
+    sentence = f"{REFUSED}: this is the best guess of a refused result. What is copied says so in its first line."
+    return Section("The refused estimate", (Text((sentence,)), page_parts.copies_of(*pose, warning=REFUSED)))
 
 
 def _accepted(result: CalibrationResult) -> bool:

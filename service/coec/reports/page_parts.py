@@ -159,43 +159,44 @@ def axes_table(
     return AxesTable(caption, value_name, tuple(lines), tuple(more))
 
 
-def copies_of(transform: Transform, camera: str, lidar: str) -> Copies:
-    """A transform in the forms that other programs take."""
+def copies_of(transform: Transform, camera: str, lidar: str, *, warning: str = "") -> Copies:
+    """A transform in the forms that other programs take. A `warning` is the first line of each, as a comment."""
     T_lidar_camera = se3.inverse(np.array(transform.matrix))
     rows = [list(row) for row in transform.matrix]
     inverse = [[float(value) for value in row] for row in T_lidar_camera]
     x, y, z, w = transform.quaternion_xyzw
+    above = f"# {warning}\n" if warning else ""
     return Copies(
         (
             Copy(
                 "T_camera_lidar, 4 × 4",
                 f"p_camera = T · p_lidar, metres: from {lidar} to {camera}. The copy has every digit, as JSON.",
-                _matrix(rows),
-                json.dumps(rows),
+                above + _matrix(rows),
+                above + json.dumps(rows),
             ),
             Copy(
                 "Translation and quaternion",
                 "The same as x y z (m) and qx qy qz qw, the order of ROS and Eigen's coefficients.",
-                _matrix((transform.translation_m, (x, y, z, w))),
-                " ".join(repr(value) for value in (*transform.translation_m, x, y, z, w)),
+                above + _matrix((transform.translation_m, (x, y, z, w))),
+                above + " ".join(repr(value) for value in (*transform.translation_m, x, y, z, w)),
             ),
             Copy(
                 "T_lidar_camera, 4 × 4",
                 f"The inverse: from {camera} to {lidar}. As JSON.",
-                _matrix(inverse),
-                json.dumps(inverse),
+                above + _matrix(inverse),
+                above + json.dumps(inverse),
             ),
         )
     )
 
 
 def figures_block(
-    caption: str, metrics: Mapping[str, MetricReply], *, compared: frozenset[str] = frozenset()
+    caption: str, metrics: Mapping[str, MetricReply], *, deciding: frozenset[str] | None = None
 ) -> Figures:
-    """Every figure with its limit, its meaning and, where it fails, what to do; failing ones first. Figures in
-    `compared` decide nothing and get no advice."""
-    lines = [_figure(name, metric, name in compared) for name, metric in metrics.items()]
-    return Figures(caption, tuple(sorted(lines, key=lambda line: line.met is not False)))
+    """Every figure with its limit, its meaning and, where it fails, what to do; failing ones first. Figures that are
+    not among the `deciding` ones (None: all decide) come last, in grey and without advice."""
+    lines = [_figure(name, metric, deciding is None or name in deciding) for name, metric in metrics.items()]
+    return Figures(caption, tuple(sorted(lines, key=lambda line: (not line.decided, line.met is not False))))
 
 
 def title_of(name: str) -> str:

@@ -16,6 +16,7 @@ from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import Matrix4, Window
 from coec.config import LimitsConfig
 from coec.geometry import cameras
+from coec.io.exported_extrinsic import REFUSED
 from coec.io.images import decode_bgr
 from coec.io.mcap.window_reader import read_result, read_window
 from coec.io.recordings import window_cutting
@@ -320,7 +321,8 @@ def _repair(result: replies.CalibrationResult, window: Path | None) -> tuple[Blo
         "figures are of its self-diagnosis, without the truth; a result is accepted if it is within all limits."
     )
     links = () if window is None else (_window(window),)
-    copies = copies_of(result.camera_from_lidar, result.camera_frame, result.lidar_frame)
+    warning = "" if result.verdict.decision == "accepted" else REFUSED
+    copies = copies_of(result.camera_from_lidar, result.camera_frame, result.lidar_frame, warning=warning)
     return Text((text,)), figures_block("Figures of self-diagnosis", result.metrics), copies, *links
 
 
