@@ -19,6 +19,7 @@ def test_one_check_at_a_right_and_at_a_wrong_extrinsic(coec: Coec, tmp_path: Pat
     right = coec("diagnose", RIG, "--depth", "stereo", "--json")
     assert right.status == 0
     assert right.document["causes"] == []
+    assert right.document["decided_by"] == ["distance_pose", "distance_rotation"]
     assert right.document["flagged_by_paper"] is None
     assert right.document["drift"] is None
     assert [len(right.document[name]) for name in ("first_derivative", "second_derivative")] == [6, 6]

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.sensor_faults import Cause
-from coec.reports import diagnosis
+from coec.calibration.types import Metric
+from coec.io.serialise import metric_of
+from coec.reports import console, diagnosis
+from coec.reports.page_parts import figures_block
 
 SIGMA = (0.12, 0.12, 0.13, 0.03, 0.03, 0.03)
 NOWHERE = (0.02, -0.01, 0.05, 0.0, 0.01, 0.0)
@@ -65,6 +69,44 @@ def test_a_right_one_says_what_would_not_be_seen(capsys: pytest.CaptureFixture[s
     shown = capsys.readouterr().out
     assert "less than 0.39°" in shown
     assert "faint" in shown
+
+
+def metric(name: str, value: float, limit: float = 1.0, *, at_least: bool = False) -> Metric:
+    return Metric(name, value, limit, at_least=at_least)
+
+
+FIGURES = (
+    metric("mi", 0.5, at_least=True),
+    metric("distance_rotation", 0.4),
+    metric("distance_pose", 0.6),
+    metric("edges_kept_rotation", 0.5, at_least=True),
+    metric("certainty_pose", 0.2),
+    metric("overlap", 2.0, at_least=True),
+)
+
+
+@pytest.mark.parametrize(
+    ("changes", "names"),
+    [
+        ({}, {"distance_rotation", "distance_pose"}),
+        ({"flagged": True}, {"distance_rotation", "distance_pose", "edges_kept_rotation"}),
+        ({"weak": True}, {"distance_rotation", "distance_pose", "edges_per_pair"}),
+        ({"causes": (Cause("image_frozen", "every picture is the same.", "Look at the camera."),)}, set()),
+    ],
+)
+def test_the_figures_on_which_a_finding_rests(changes: dict[str, Any], names: set[str]) -> None:
+    assert diagnosis.deciding(replace(RIGHT, metrics=FIGURES, **changes)) == names
+
+
+def test_figures_that_did_not_decide_are_visibly_secondary(capsys: pytest.CaptureFixture[str]) -> None:
+    replies = {one.name: metric_of(one) for one in FIGURES}
+    deciding = diagnosis.deciding(replace(RIGHT, metrics=FIGURES))
+    console.show_metrics(replies, deciding)
+    marks = {line.split()[0]: line.split()[-1] for line in capsys.readouterr().out.splitlines()}
+    assert (marks["distance_pose"], marks["overlap"], marks["mi"]) == ("✓", "(✓)", "(✗)")
+    lines = figures_block("", replies, deciding=deciding).lines
+    assert [line.code for line in lines[:2]] == ["distance_rotation", "distance_pose"]
+    assert not any(line.decided or line.advice for line in lines[2:])
 
 
 MEASURED = diagnosis.SolvedOffset(

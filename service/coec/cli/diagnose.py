@@ -132,6 +132,7 @@ def _document(
     seen: Observation, finding: diagnosis.ExtrinsicFinding, measured: diagnosis.SolvedOffset | None
 ) -> dict[str, Any]:
     from coec.io.serialise import in_degrees, metric_of
+    from coec.reports import diagnosis
 
     return {
         "finding": finding.state,
@@ -147,11 +148,14 @@ def _document(
         "drift_sigma": None if seen.drift is None else in_degrees(seen.drift.sigma).tolist(),
         "first_derivative": seen.first_derivative.tolist(),
         "second_derivative": seen.second_derivative.tolist(),
+        "decided_by": sorted(diagnosis.deciding(seen)),
         "metrics": {metric.name: metric_of(metric).model_dump(mode="json") for metric in seen.metrics},
     }
 
 
 def _show(seen: Observation, finding: diagnosis.ExtrinsicFinding) -> None:
+    from rich.text import Text
+
     from coec.io.serialise import in_degrees, metric_of
     from coec.reports import console, diagnosis
 
@@ -163,12 +167,15 @@ def _show(seen: Observation, finding: diagnosis.ExtrinsicFinding) -> None:
             console.figure(offset[axis], sign=True),
             console.figure(sigma[axis]),
             console.UNITS[axis],
-            console.figure(float(seen.first_derivative[axis]), sign=True),
-            console.figure(float(seen.second_derivative[axis]), sign=True),
+            # The paper's derivatives decide nothing.
+            Text(console.figure(float(seen.first_derivative[axis]), sign=True), "dim"),
+            Text(console.figure(float(seen.second_derivative[axis]), sign=True), "dim"),
+            style="dim" if seen.causes else "",
         )
     diagnosis.show(finding)
     console.out.print(axes)
-    console.show_metrics({metric.name: metric_of(metric) for metric in seen.metrics if metric.value is not None})
+    metrics = {metric.name: metric_of(metric) for metric in seen.metrics if metric.value is not None}
+    console.show_metrics(metrics, diagnosis.deciding(seen))
 
 
 def _measured(rigged: RigWindows, window: Window, seen: Observation) -> diagnosis.SolvedOffset | None:

@@ -347,14 +347,20 @@ def show_verdict(result: replies.CalibrationResult) -> None:
     show_metrics(result.metrics)
 
 
-def show_metrics(metrics: dict[str, replies.MetricReply]) -> None:
-    """Prints every figure beside the limit that judged it."""
+def show_metrics(metrics: dict[str, replies.MetricReply], deciding: frozenset[str] | None = None) -> None:
+    """Prints every figure beside the limit that judged it. Figures that are not among the `deciding` ones (None: all
+    decide) are faint and in brackets."""
     if not metrics:
         return
     figures = table("figure", "value", "limit", "", right=(1,))
     for name, metric in metrics.items():
-        figures.add_row(name, figure(metric.value), *limit_of(metric))
+        limit, mark = limit_of(metric)
+        decided = deciding is None or name in deciding
+        mark = mark if decided or not mark else Text(f"({mark.plain})")
+        figures.add_row(name, figure(metric.value), limit, mark, style="" if decided else "dim")
     out.print(figures)
+    if deciding is not None:
+        show("Figures with their mark in brackets, or without one, did not enter the decision.", "dim")
 
 
 def limit_of(metric: replies.MetricReply) -> tuple[str, Text]:

@@ -3,7 +3,7 @@ console, and as a page.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -160,8 +160,20 @@ def _signed(value: float, digits: int) -> str:
     return f"{value:+.{digits}f}".replace("-", "−")
 
 
-OF_PAPER = frozenset({"mi", "f1", "f2"})
-"""Figures that are shown for comparison and decide nothing."""
+DISTANCES = frozenset({"distance_rotation", "distance_pose"})
+INSISTING = frozenset({"edges_kept_rotation", "edges_kept_pose", "certainty_rotation", "certainty_pose"})
+"""Figures of a check that decide: how far off its optima are; and for those that are off, whether the edges insist."""
+
+
+def deciding(seen: Observation) -> frozenset[str]:
+    """Names of the figures on which the finding of a check rests. A right extrinsic is near both optima; a wrong one is
+    far from an optimum on which the edges insist; wrong data say nothing of it."""
+    if seen.causes:
+        return frozenset()
+    faint = {"edges_per_pair"} if seen.weak else set()
+    if not (seen.flagged or seen.undecided):
+        return DISTANCES | faint
+    return DISTANCES | faint | {m.name for m in seen.metrics if m.name in INSISTING and not m.passed}
 
 
 def check_page(
@@ -190,12 +202,13 @@ def check_page(
     }
     table = page_parts.axes_table(
         "From the extrinsic to where this check puts the camera, about and along its axes (x right, y down, z "
-        "forward). f′ and f″ are the paper’s derivatives of mutual information, per radian or metre.",
+        "forward). f′ and f″, the paper’s derivatives of mutual information per radian or metre, decide nothing.",
         "Offset",
         offset,
         sigma,
         more=slopes if measured is None else {"By a solve of all pairs": _by_axis(measured), **slopes},
     )
+    table = replace(table, quiet=frozenset(slopes))
     shown = tuple(page_parts.file_picture(path) for path in pictures)
     sections = (
         *((Section("Pictures", (Pictures(shown),)),) if shown else ()),
@@ -209,7 +222,9 @@ def check_page(
                     quiet=True,
                 ),
                 page_parts.figures_block(
-                    "Figures of the check", {m.name: metric_of(m) for m in seen.metrics}, compared=OF_PAPER
+                    "Figures of the check; grey ones did not enter the decision",
+                    {m.name: metric_of(m) for m in seen.metrics},
+                    deciding=deciding(seen),
                 ),
             ),
         ),

@@ -87,6 +87,7 @@ class AxesTable:
     Attributes:
         value_name: what the values are: correction, offset, bias.
         more: heads of further number columns.
+        quiet: those of them that did not enter the decision; they are grey.
     """
 
     template: ClassVar = "axes"
@@ -94,6 +95,7 @@ class AxesTable:
     value_name: str
     lines: tuple[AxisLine, ...]
     more: tuple[str, ...] = ()
+    quiet: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +182,7 @@ class FigureLine:
         limit: with its sign; empty where there is none, and then `met` is None.
         margin: where the figure stands between failing (0), its limit (½) and plenty (1); None where that is unknown.
         advice: what to do; empty where the limit is met.
+        decided: whether it entered the decision; one that did not is grey.
     """
 
     code: str
@@ -191,6 +194,7 @@ class FigureLine:
     margin: float | None
     meaning: str
     advice: str
+    decided: bool = True
 
 
 @dataclass(frozen=True, slots=True)

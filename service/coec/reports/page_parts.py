@@ -227,11 +227,11 @@ def _advice(code: str) -> str:
     return OTHER_ADVICE.get(code, "")
 
 
-def _figure(name: str, metric: MetricReply, compared: bool) -> FigureLine:
+def _figure(name: str, metric: MetricReply, decided: bool) -> FigureLine:
     known = FIGURES.get(name)
     met = None if metric.limit is None else metric.passed
     meaning = "" if known is None else known.measures
-    if met is False and known is not None:
+    if met is False and known is not None and decided:
         meaning = f"{meaning} Here: {known.fails}."
     return FigureLine(
         code=name,
@@ -242,7 +242,8 @@ def _figure(name: str, metric: MetricReply, compared: bool) -> FigureLine:
         met=met,
         margin=_margin(metric),
         meaning=meaning,
-        advice="" if met is not False or known is None or compared else known.advice,
+        advice=known.advice if met is False and known is not None and decided else "",
+        decided=decided,
     )
 
 
