@@ -11,13 +11,14 @@ import pytest
 from coec.calibration.types import LidarFrame, Matrix4, Window
 from coec.config import LimitsConfig
 from coec.geometry import se3
+from coec.geometry.edges.image_edges import Rectangle
 from coec.io.images import GreyImages
 from coec.reports.close_ups import COLOURS, Caption, close_ups, sentences
-from coec.reports.difference_regions import difference_regions, shift_px
+from coec.reports.difference_regions import difference_regions, outlines_of, shift_px, spread_px
 from support import scenes
 
 TURN = np.array([0.0, radians(0.5), 0.0, 0.0, 0.0, 0.0])
-SIGMA = np.array([radians(0.02), radians(0.03), radians(0.04), np.nan, np.nan, np.nan])
+COVARIANCE = np.diag(np.square([radians(0.02), radians(0.03), radians(0.04), np.nan, np.nan, np.nan]))
 
 
 def _reported(window: Window, T_before: Matrix4, T_after: Matrix4, caption: Caption) -> list[str]:
@@ -35,10 +36,27 @@ def test_the_text_report_time_difference_spread_and_network() -> None:
     window = scenes.post_window((-8.0, 8.0))
     truth = window.T_camera_lidar_start
     moved = se3.perturb(truth, TURN)
-    lines = _reported(window, moved, truth, Caption("start", "accepted", SIGMA, "tiny.onnx"))
+    lines = _reported(window, moved, truth, Caption("start", "accepted", COVARIANCE, "tiny.onnx"))
     assert lines[0].startswith("front, 2020-09-13 12:26:40.123Z: start and accepted are 0.50° and 0.0 cm apart")
     assert lines[1] == "accepted − start: pitch +0.00 ± 0.02°, yaw −0.50 ± 0.03°, roll +0.00 ± 0.04°"
     assert lines[2] == "depth network: tiny.onnx"
+    assert any(line.startswith("σ: standard deviation to which accepted is known") for line in lines)
+
+
+def test_the_spread_of_a_part_is_that_of_its_range_edges() -> None:
+    window = scenes.post_window((-8.0, 8.0))
+    truth, camera = window.T_camera_lidar_start, window.rig.camera
+    outlines, whole = (
+        outlines_of(window.pairs[0], window.rig, compensated=True),
+        Rectangle(0, 0, camera.width, camera.height),
+    )
+    yaw = np.diag([0.0, radians(0.03) ** 2, 0.0, np.nan, np.nan, np.nan])
+    # A turn moves what is seen near the axis by the focal length times the angle.
+    assert spread_px(outlines, window.rig, truth, yaw, whole) == pytest.approx(camera.fx * radians(0.03), rel=0.05)
+    cancelling = np.full((6, 6), np.nan)
+    cancelling[:2, :2] = 0.0
+    assert spread_px(outlines, window.rig, truth, cancelling, whole) == 0.0
+    assert np.isnan(spread_px(outlines, window.rig, truth, yaw, Rectangle(0, 0, 1, 1)))
 
 
 def test_a_stamp_that_is_no_date_is_reported_in_seconds() -> None:
@@ -72,9 +90,9 @@ def test_a_cloud_without_points_is_a_picture_with_text() -> None:
 def test_outlines_are_detected_through_every_camera(model: str) -> None:
     window = scenes.post_window((-14.0, 10.0), scenes.POST_LENSES[model])
     truth = window.T_camera_lidar_start
-    before, after = _reported(window, se3.perturb(truth, TURN), truth, Caption())[-1].split("shown: ")[1].split(", ")
-    before_sigma, after_sigma = (float(reported.split()[1].replace("−", "-")) for reported in (before, after))
-    assert before_sigma < 0.7 < 1.5 < after_sigma
+    before, after = _reported(window, se3.perturb(truth, TURN), truth, Caption())[-1].split("image: ")[1].split(", ")
+    before_edges, after_edges = (float(text.split()[1].strip(".").replace("−", "-")) for text in (before, after))
+    assert before_edges < 0.7 < 1.5 < after_edges
 
 
 @pytest.mark.parametrize("model", ["pinhole", "double_sphere"])

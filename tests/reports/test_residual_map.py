@@ -13,6 +13,7 @@ from coec.config import LimitsConfig
 from coec.geometry import se3
 from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
 from coec.io.images import GreyImages
+from coec.reports.difference_regions import angles_deg
 from coec.reports.residual_map import (
     lens_residual,
     lens_sentences,
@@ -34,8 +35,32 @@ def test_the_text_report_what_all_parts_have_in_common() -> None:
     assert lines[0] == f"front, {when} to {when}: range edges on edges of the image at start"
     assert "from 4 pairs" in lines[1]
     assert "a pixel is 0.143° on the axis" in lines[1]
-    right_px = float(lines[2].split("to all: ")[1].split(" px")[0].replace("−", "-"))
+    right_deg, right_px = (
+        float(lines[2].split(before)[1].split(after)[0].replace("−", "-"))
+        for before, after in (("to all: ", "° right"), ("right (", " px)"))
+    )
     assert right_px == pytest.approx(-400.0 * np.tan(radians(0.5)), abs=1.0)
+    assert right_deg == pytest.approx(-0.5, abs=0.15)
+
+
+def test_what_all_parts_have_in_common_is_compared_with_sigma() -> None:
+    window = scenes.post_window(tuple(np.arange(-36.0, 37.0, 4.0).tolist()))
+    window = replace(window, pairs=window.pairs * 4)
+    moved = se3.perturb(window.T_camera_lidar_start, np.array([0, radians(0.5), 0, 0, 0, 0]))
+    shifts = local_shifts(window, GreyImages(LimitsConfig()), moved, compensated=True)
+    line = sentences(window, shifts, "result", np.radians([0.2, 0.1, 0.1, np.nan, np.nan, np.nan]))[2]
+    assert float(line.split(" σ of yaw")[0].split(", ")[-1]) == pytest.approx(5.0, abs=1.5)
+    assert "σ of pitch" in line
+
+
+def test_a_shift_is_an_angle_at_its_place_in_the_image() -> None:
+    """A pixel at the rim of a pinhole's image covers a smaller angle than one in its middle."""
+    pinhole = scenes.POST_LENSES["pinhole"]
+    from_px = np.array([[pinhole.cx, pinhole.cy], [pinhole.cx + pinhole.fx, pinhole.cy], [np.nan, 0.0]])
+    middle, rim, unknown = angles_deg(pinhole, from_px, from_px + np.array([1.0, 0.0]))
+    assert middle == pytest.approx(np.degrees(1.0 / pinhole.fx), rel=1e-3)
+    assert rim == pytest.approx(0.5 * middle, rel=5e-3)
+    assert np.isnan(unknown)
 
 
 def test_a_picture_without_a_range_edge_reports_that_nothing_is_reported() -> None:

@@ -14,12 +14,8 @@ from coec.cli.options import Json, Source, with_calibration_options
 from coec.errors import LensError, OutputError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from coec.geometry.cameras import Camera
     from coec.recording import Solution
-    from coec.schemas.replies import CalibrationResult
 
 
 @with_calibration_options(CalibrationOptions)
@@ -140,7 +136,7 @@ def _write(
     caption = Caption(
         before="start",
         after=f"result ({result.verdict.decision})",
-        sigma=_sigma_of(result),
+        covariance=solution.estimate.uncertainty.covariance,
         network=pictures.network_text(solution.configuration.depth.model, result.depth_identity),
     )
     T_result = np.array(result.camera_from_lidar.matrix)
@@ -156,15 +152,6 @@ def _write(
     remarks = calibration.remarks(document.get("camera_fit"), document.get("time_offset"))
     of_result = calibration_page(report, window, calibration.start_of(window), blocks, remarks, Provenance.here())
     return [*paths, written, page.write(folder / "report.html", of_result)], comparison.left_out
-
-
-def _sigma_of(result: CalibrationResult) -> NDArray[np.float64]:
-    """(6,) in radians and metres; NaN where there is none."""
-    import numpy as np
-
-    sigma = np.array([np.nan if value is None else value for value in result.sigma], dtype=np.float64)
-    sigma[:3] = np.radians(sigma[:3])
-    return np.where(np.array(result.solved), sigma, np.nan)
 
 
 @contextmanager

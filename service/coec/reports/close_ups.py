@@ -18,7 +18,6 @@ from coec.config import LimitsConfig
 from coec.geometry import se3
 from coec.geometry.cameras import Camera
 from coec.geometry.edges.image_edges import Rectangle
-from coec.geometry.projection import unproject
 from coec.io.images import GreyImages, decode_bgr
 from coec.reports import drawing
 from coec.reports.difference_regions import (
@@ -26,9 +25,11 @@ from coec.reports.difference_regions import (
     DifferenceRegions,
     Outlines,
     Shift,
+    angles_deg,
     difference_regions,
     project_outlines,
     shift_px,
+    spread_px,
 )
 from coec.reports.drawing import LABEL_PX, LINE_PX, TEXT_PX, Pixels
 from coec.reports.formatting import count, instant, number
@@ -77,14 +78,19 @@ class Caption:
 
     Attributes:
         before, after: their names.
-        sigma: (6,) standard deviations of the second one, radians and metres, NaN where there is none; None: not known.
+        covariance: (6, 6) of the error of the second one, radians and metres, NaN where there is none; None: not known.
         network: the depth network that took part; empty: none, or not known.
     """
 
     before: str = "before"
     after: str = "after"
-    sigma: NDArray[np.float64] | None = None
+    covariance: NDArray[np.float64] | None = None
     network: str = ""
+
+    @property
+    def sigma(self) -> NDArray[np.float64]:
+        """(6,) standard deviations of the second one, radians and metres; NaN where there is none."""
+        return np.full(6, np.nan) if self.covariance is None else np.sqrt(self.covariance.diagonal())
 
 
 PLAIN = Caption()
@@ -134,15 +140,38 @@ def close_ups(
     _overview(picture, Rectangle((width - overview[0]) // 2, top, *overview), image, telling.regions)
     for row, place in enumerate(telling.regions):
         below = top + overview[1] + GAP_PX + row_px * row + TITLE_PX
-        for column, (T, name) in enumerate(((T_before, caption.before), (T_after, caption.after))):
+        titles = _titles(NAMES[row], place, telling.outlines, window.rig, T_after, caption)
+        for column, (T, title) in enumerate(zip((T_before, T_after), titles, strict=True)):
             left = GAP_PX + AXIS_PX + column * (PANEL_PX[0] + GAP_PX + AXIS_PX)
             shown = Rectangle(left, below, *drawing.fitted(place.part.width, place.part.height, PANEL_PX))
             panel = picture[shown.slices]
             _panel(panel, image, window.rig, telling.outlines, T, place.part, COLOURS[column])
             drawing.axes(picture, shown, place.part)
-            strength = number(place.strength[column], 1, sign=True)
-            drawing.write(picture, f"{NAMES[row]}  {name}: {strength} σ", (left, below - 8))
+            drawing.write(picture, title, (left, below - 8))
     return picture
+
+
+def _titles(
+    letter: str, place: DifferenceRegion, outlines: Outlines, rig: Rig, T_after: Matrix4, caption: Caption
+) -> tuple[str, str]:
+    """Above both pictures of a part: how far the first extrinsic puts its outlines from where the second does, and how
+    well the second is known there, each in degrees, pixels and σ of the second; and the strength of the edges."""
+    middle_px = np.array([place.part.left + 0.5 * place.part.width, place.part.top + 0.5 * place.part.height])
+    (deg_per_px,) = angles_deg(rig.camera, middle_px[None] - (0.5, 0.0), middle_px[None] + (0.5, 0.0))
+    spread = np.nan
+    if caption.covariance is not None:
+        spread = spread_px(outlines, rig, T_after, caption.covariance, place.part)
+
+    def size(px: float) -> str:
+        return f"{number(px * deg_per_px, 2)}° = {px:.1f} px"
+
+    away = size(place.across_px) + (f" = {place.across_px / spread:.1f} σ" if spread > 0.0 else "")
+    known = f"σ {size(spread)}, " if spread > 0.0 else ""
+    before, after = (number(strength, 1, sign=True) for strength in place.strength)
+    return (
+        f"{letter}  {caption.before}: {away} beside, edges {before}",
+        f"{letter}  {caption.after}: {known}edges {after}",
+    )
 
 
 def difference_text(T_before: Matrix4, T_after: Matrix4) -> str:
@@ -166,7 +195,9 @@ def sentences(
     if shift is not None and shift.largest_px < SAME_PX:
         lines = [f"{where}: no difference between {names}: less than {SAME_PX:g} px anywhere in the image"]
     else:
-        on_image = "" if shift is None else f", {shift.median_px:.1f} px in the image (median)"
+        on_image = (
+            "" if shift is None else f", {shift.median_deg:.2f}° = {shift.median_px:.1f} px in the image (median)"
+        )
         lines = [f"{where}: {names} are {difference_text(T_before, T_after)} apart{on_image}"]
         lines.append(
             f"{caption.after} − {caption.before}: {_axes_text(se3.difference(T_after, T_before), caption.sigma)}"
@@ -176,22 +207,23 @@ def sentences(
     if telling.regions:
         lines.append(
             "Lines: outlines of near things that the LiDAR saw; dots: its other range edges. They belong on edges of "
-            "the image."
+            "the image. Axes: pixels."
         )
-        lines.append("σ: how much stronger these are under the outlines than on average, 0 is chance. Axes: pixels.")
+        if caption.covariance is not None:
+            lines.append(f"σ: standard deviation to which {caption.after} is known, at what is shown.")
         before, after = telling.strength
         lines.append(
-            f"All outlines of {count(telling.frames, 'image')}, not only those shown: {caption.before} "
-            f"{number(before, 2, sign=True)} σ, {caption.after} {number(after, 2, sign=True)} σ."
+            "Edges: mean strength of the image's edges under the outlines; 0 as anywhere in the image, 1 as its "
+            f"stronger sixth. On all outlines of {count(telling.frames, 'image')}: {caption.before} "
+            f"{number(before, 2, sign=True)}, {caption.after} {number(after, 2, sign=True)}."
         )
     else:
         lines.append("No outline of a near thing is in view at both extrinsics: there is nothing to enlarge.")
     return lines
 
 
-def _axes_text(difference: NDArray[np.float64], sigma: NDArray[np.float64] | None) -> str:
+def _axes_text(difference: NDArray[np.float64], spread: NDArray[np.float64]) -> str:
     """The shift by axis, with its standard deviation where that is known; translations only where there are any."""
-    spread = np.full(6, np.nan) if sigma is None else sigma
     parts = []
     for axis, name in enumerate(("pitch", "yaw", "roll", "right", "down", "forward")):
         factor, unit, digits = (degrees(1.0), "°", 2) if axis < 3 else (100.0, " cm", 1)
@@ -253,8 +285,8 @@ def _scale_bar(panel: Pixels, camera: Camera, part: Rectangle) -> None:
     height, width = panel.shape[:2]
     length = max((bar for bar in BAR_LENGTHS_PX if bar <= BAR_SHARE * part.width), default=BAR_LENGTHS_PX[0])
     u, v = part.left + 0.5 * part.width, part.top + 0.5 * part.height
-    rays, valid = unproject(camera, np.array([[u - 0.5 * length, v], [u + 0.5 * length, v]]))
-    angle = f" = {degrees(np.arccos(np.clip(rays[0] @ rays[1], -1.0, 1.0))):.2f}°" if valid.all() else ""
+    (angle_deg,) = angles_deg(camera, np.array([[u - 0.5 * length, v]]), np.array([[u + 0.5 * length, v]]))
+    angle = f" = {angle_deg:.2f}°" if np.isfinite(angle_deg) else ""
     x, y = round(0.03 * width), round(0.93 * height)
     bar = Rectangle(x, y, round(length * width / part.width), max(4, round(0.025 * height)))
     drawing.tint(panel, bar, drawing.WHITE)

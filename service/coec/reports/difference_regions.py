@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.types import FramePair, ImageReader, Matrix4, Rig, Window
 from coec.errors import CalibrationError
+from coec.geometry import se3
 from coec.geometry.cameras import Camera, in_image
 from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID, EdgeScales, Rectangle
 from coec.geometry.edges.range_edges import range_edges
-from coec.geometry.projection import project
+from coec.geometry.projection import project, unproject
 from coec.geometry.sweep_kernels import Bearings, bearings
 
 NEXT_LINE_RAD = (radians(0.05), radians(2.2))
@@ -229,10 +230,41 @@ class DifferenceRegions:
 
 @dataclass(frozen=True, slots=True)
 class Shift:
-    """Shift of range edges in the image: the median and the largest, pixels."""
+    """Shift of range edges in the image: the median and the largest, pixels, and the median angle, degrees."""
 
     median_px: float
     largest_px: float
+    median_deg: float
+
+
+def angles_deg(camera: Camera, from_px: NDArray[np.float64], to_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N,) angles between the rays of pixels (N, 2) and of others (N, 2); NaN where the lens has no ray."""
+    (one, known), (other, also_known) = unproject(camera, from_px), unproject(camera, to_px)
+    # The arc cosine would lose angles below a hundredth of a degree.
+    sine, cosine = np.linalg.norm(np.cross(one, other), axis=1), np.sum(one * other, axis=1)
+    return np.where(known & also_known, np.degrees(np.arctan2(sine, cosine)), np.nan)
+
+
+STEP = 1e-4
+"""Difference step of a pose, radians and metres."""
+
+
+def spread_px(
+    outlines: Outlines, rig: Rig, T_camera_lidar: Matrix4, covariance: NDArray[np.float64], part: Rectangle
+) -> float:
+    """How far the range edges in a part of an image lie from where they belong, root mean square, pixels, if the error
+    of the extrinsic (4, 4) has a `covariance` (6, 6; rad, m; NaN on axes that were not determined, which count as
+    known). NaN without a range edge there."""
+    at = project_outlines(outlines, rig, T_camera_lidar)
+    inside = at.seen & _within(at.uv_px[:, 0], part.left, part.width) & _within(at.uv_px[:, 1], part.top, part.height)
+    if not inside.any():
+        return float("nan")
+    moved = [
+        project_outlines(outlines, rig, se3.perturb(T_camera_lidar, STEP * unit)).uv_px[inside] for unit in np.eye(6)
+    ]
+    jacobian = (np.stack(moved, axis=2) - at.uv_px[inside][:, :, None]) / STEP
+    squares = np.einsum("nia,ab,nib->n", jacobian, np.nan_to_num(covariance), jacobian)
+    return float(np.sqrt(np.median(squares)))
 
 
 def swept(outlines: Outlines, edges: NDArray[np.int8], rig: Rig, T_one: Matrix4, T_other: Matrix4) -> Swept:
@@ -319,7 +351,8 @@ def shift_px(window: Window, T_one: Matrix4, T_other: Matrix4, *, compensated: b
     if not both.any():
         return None
     distances_px = np.linalg.norm(one.uv_px[both] - other.uv_px[both], axis=1)
-    return Shift(float(np.median(distances_px)), float(distances_px.max()))
+    angles = angles_deg(window.rig.camera, one.uv_px[both], other.uv_px[both])
+    return Shift(float(np.median(distances_px)), float(distances_px.max()), float(np.nanmedian(angles)))
 
 
 def evenly(count: int, at_most: int) -> list[int]:

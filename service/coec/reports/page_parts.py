@@ -80,11 +80,13 @@ CAPTIONS: Mapping[str, tuple[str, str]] = {
     ),
     "close_ups": (
         "Enlarged parts of the image with the range edges of the LiDAR, at the start and at the result",
-        "Close-ups where both extrinsics differ most: range edges should lie on the edges of the image.",
+        "Close-ups where both extrinsics differ most: range edges should lie on the edges of the image. Above each: "
+        "how far the start is off, and σ of the result there.",
     ),
     "residuals": (
         "Map over the image of how well range edges and image edges agree at the result",
-        "Where in the image range edges and image edges agree at the result, and where they do not.",
+        "Where in the image range edges and image edges agree at the result, in degrees and pixels. What all parts "
+        "have in common compares with the σ of the result; a single part scatters more.",
     ),
     "lens_residual": (
         "Map over the image of how far the fitted camera model is from the one it stands for",

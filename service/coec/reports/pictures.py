@@ -109,7 +109,7 @@ def write_comparison(
             "would look right or wrong by chance."
         )
         return Comparison(tuple(files), (slid, Pictures((file_picture(files[-1]),)), Text((why,), quiet=True)), (why,))
-    left = residual_map(window, T_after, compensated=compensated, name=caption.after)
+    left = residual_map(window, T_after, compensated=compensated, name=caption.after, sigma=caption.sigma)
     files.append(write_output(folder / "residuals.png", encode_png(left)))
     return Comparison(tuple(files), (slid, Pictures(tuple(map(file_picture, files[2:])))), ())
 

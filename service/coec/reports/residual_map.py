@@ -25,7 +25,7 @@ from coec.geometry.projection import points_in_view, project, unproject
 from coec.io.images import GreyImages, decode_grey
 from coec.reports import drawing
 from coec.reports.charts import Tick, linear_ticks, tick_label
-from coec.reports.difference_regions import evenly
+from coec.reports.difference_regions import angles_deg, evenly
 from coec.reports.drawing import LABEL_PX, LINE_PX, Pixels
 from coec.reports.formatting import count, instant, number
 
@@ -66,6 +66,7 @@ class LocalShifts:
             image.
         frames: how many pairs were looked at.
         reach_px: how far range edges were shifted.
+        deg_per_px: the angle that a pixel covers along the shift, at the middle of the cell; NaN where unknown.
     """
 
     edges: NDArray[np.int64]
@@ -73,6 +74,7 @@ class LocalShifts:
     strength: NDArray[np.float64]
     frames: int
     reach_px: int
+    deg_per_px: NDArray[np.float64]
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -83,6 +85,11 @@ class LocalShifts:
     def size_px(self) -> NDArray[np.float64]:
         """(R, C) lengths of the shifts."""
         return np.hypot(self.shift_px[..., 0], self.shift_px[..., 1])
+
+    @property
+    def size_deg(self) -> NDArray[np.float64]:
+        """(R, C) angles of the shifts."""
+        return self.size_px * self.deg_per_px
 
 
 def local_shifts(window: Window, images: ImageReader, T_camera_lidar: Matrix4, *, compensated: bool) -> LocalShifts:
@@ -126,12 +133,17 @@ def local_shifts(window: Window, images: ImageReader, T_camera_lidar: Matrix4, *
     for k in np.flatnonzero(edges >= LEAST_EDGES):
         shift[k] = _best(z[:, :, k], reach)
     mean = sums[reach, reach] / np.maximum(spread, 1e-9)
+    v, u = np.indices((rows, columns)).reshape(2, -1) + 0.5
+    middle_px = np.column_stack([u * camera.width / columns, v * camera.height / rows]) - 0.5
+    way = shift / np.maximum(np.hypot(*shift.T), 1e-9)[:, None]
+    deg_per_px = angles_deg(camera, middle_px - 0.5 * way, middle_px + 0.5 * way)
     return LocalShifts(
         edges.reshape(rows, columns),
         shift.reshape(rows, columns, 2),
         np.where(edges > 0, mean, np.nan).reshape(rows, columns),
         len(sampled),
         reach,
+        deg_per_px.reshape(rows, columns),
     )
 
 
@@ -220,12 +232,19 @@ ARROW_SHARE = 0.42
 """The longest arrow, as a share of a cell's shorter side."""
 
 
-def residual_map(window: Window, T_camera_lidar: Matrix4, *, compensated: bool = True, name: str = "") -> Pixels:
-    """The map of a window at an extrinsic (4, 4), which is called `name`.
+def residual_map(
+    window: Window,
+    T_camera_lidar: Matrix4,
+    *,
+    compensated: bool = True,
+    name: str = "",
+    sigma: NDArray[np.float64] | None = None,
+) -> Pixels:
+    """The map of a window at an extrinsic (4, 4), which is called `name` and known to `sigma` (6,) radians and metres.
 
     Returns:
-        (H, W, 3) uint8 BGR on white: in each cell how many pixels its range edges are off the edges of the image, and
-        how many range edges there are.
+        (H, W, 3) uint8 BGR on white: in each cell how many degrees and pixels its range edges are off the edges of the
+        image, and how many range edges there are.
 
     Raises:
         DecodeError: an image cannot be decoded.
@@ -233,11 +252,12 @@ def residual_map(window: Window, T_camera_lidar: Matrix4, *, compensated: bool =
     """
     shifts = local_shifts(window, GreyImages(LimitsConfig()), T_camera_lidar, compensated=compensated)
     pair = window.pairs[len(window.pairs) // 2]
-    text = drawing.folded(sentences(window, shifts, name), PICTURE_PX[0])
-    return _render(decode_grey(pair.camera.image, LimitsConfig()), shifts, text)
+    text = drawing.folded(sentences(window, shifts, name, sigma), PICTURE_PX[0])
+    pixel_deg = degrees(pixel_rad(window.rig.camera))
+    return _render(decode_grey(pair.camera.image, LimitsConfig()), shifts, text, pixel_deg)
 
 
-def sentences(window: Window, shifts: LocalShifts, name: str) -> list[str]:
+def sentences(window: Window, shifts: LocalShifts, name: str, sigma: NDArray[np.float64] | None = None) -> list[str]:
     """The lines above the picture."""
     first, last = (instant(window.pairs[index].stamp_ns) for index in (0, -1))
     when = first if len(window.pairs) == 1 else f"{first} to {last}"
@@ -250,22 +270,34 @@ def sentences(window: Window, shifts: LocalShifts, name: str) -> list[str]:
             f"No part of the image tells where its range edges belong ({eligible} have enough of them, of {pairs})."
         )
         return lines
-    right, down = np.median(shifts.shift_px[shifts.known], axis=0).tolist()
-    deviation = shifts.shift_px[shifts.known] - (right, down)
-    spread = float(np.median(np.hypot(*deviation.T)))
-    pixel_deg = degrees(pixel_rad(window.rig.camera))
-    in_common = f"{number(right, 1, sign=True)} px right, {number(down, 1, sign=True)} px down"
+    known_deg = shifts.shift_px[shifts.known] * shifts.deg_per_px[shifts.known][:, None]
+    right, down = np.nanmedian(known_deg, axis=0).tolist()
+    right_px, down_px = np.median(shifts.shift_px[shifts.known], axis=0).tolist()
+    spread = float(np.nanmedian(np.hypot(*(known_deg - (right, down)).T)))
+    away = f"{np.nanmedian(shifts.size_deg[shifts.known]):.2f}° = {np.median(shifts.size_px[shifts.known]):.1f} px"
+    turns = [
+        f"{number(deg, 2, sign=True)}° {way} ({number(px, 1, sign=True)} px{_in_sigma(deg, axis, sigma)})"
+        for deg, px, way, axis in ((right, right_px, "right", 1), (down, down_px, "down", 0))
+    ]
     lines += [
-        f"{known} of {eligible} parts tell, from {pairs}. They lie {np.median(shifts.size_px[shifts.known]):.1f} px "
-        f"beside (median; a pixel is {pixel_deg:.3f}° on the axis).",
-        f"In common to all: {in_common}; half of them are within {spread:.1f} px of it.",
+        f"{known} of {eligible} parts tell, from {pairs}. Their range edges lie {away} beside the edges of the image "
+        f"(median; a pixel is {degrees(pixel_rad(window.rig.camera)):.3f}° on the axis).",
+        f"In common to all: {', '.join(turns)}. That much the extrinsic may be off.",
+        f"Half of the parts are within {spread:.2f}° of that: a part alone has few range edges.",
         "Arrows: where range edges would lie best, enlarged. Figures: how far that is, and of how many range edges. "
         "No colour: not told.",
     ]
     return lines
 
 
-def _render(grey: Pixels, shifts: LocalShifts, text: list[str]) -> Pixels:
+def _in_sigma(deg: float, axis: int, sigma: NDArray[np.float64] | None) -> str:
+    """A turn in standard deviations of the result about the axis that shifts the image that way; empty if unknown."""
+    if sigma is None or not sigma[axis] > 0.0:
+        return ""
+    return f", {abs(deg) / degrees(sigma[axis]):.1f} σ of {('pitch', 'yaw')[axis]}"
+
+
+def _render(grey: Pixels, shifts: LocalShifts, text: list[str], pixel_deg: float) -> Pixels:
     shown_px = drawing.fitted(grey.shape[1], grey.shape[0], PICTURE_PX)
     top = MARGIN_PX + LINE_PX * len(text) + MARGIN_PX
     picture = drawing.blank(PICTURE_PX[0] + 2 * MARGIN_PX, top + shown_px[1] + MARGIN_PX + BAR_PX + BAR_AXIS_PX)
@@ -274,17 +306,17 @@ def _render(grey: Pixels, shifts: LocalShifts, text: list[str]) -> Pixels:
     view = picture[shown.slices]
     view[:] = np.rint(255.0 - FADED * (255.0 - cv2.resize(grey, shown_px, interpolation=cv2.INTER_AREA)))[..., None]
     # A quantile, so that a cell that matches a wrong edge does not pale all others.
-    large = float(np.quantile(shifts.size_px[shifts.known], MOST)) if shifts.known.any() else 0.0
-    end_px = max(LEAST_END_PX, large)
+    sizes_deg, least_deg = shifts.size_deg[shifts.known], LEAST_END_PX * pixel_deg
+    end_deg = max(least_deg, float(np.nanquantile(sizes_deg, MOST)) if np.isfinite(sizes_deg).any() else 0.0)
     for row, column in np.ndindex(shifts.edges.shape):
-        _cell(view, shifts, (row, column), end_px)
+        _cell(view, shifts, (row, column), end_deg)
     bar = Rectangle(MARGIN_PX + PICTURE_PX[0] // 4, top + shown_px[1] + MARGIN_PX, PICTURE_PX[0] // 2, BAR_PX)
-    ticks = [Tick(value / end_px, tick_label(value)) for value in linear_ticks(0.0, end_px, 8)]
-    drawing.colour_scale(picture, bar, ticks, "range edges beside edges of the image, px", open_end=True)
+    ticks = [Tick(value / end_deg, tick_label(value)) for value in linear_ticks(0.0, end_deg, 8)]
+    drawing.colour_scale(picture, bar, ticks, "range edges beside edges of the image, degrees", open_end=True)
     return picture
 
 
-def _cell(view: Pixels, shifts: LocalShifts, place: tuple[int, int], end_px: float) -> None:
+def _cell(view: Pixels, shifts: LocalShifts, place: tuple[int, int], end_deg: float) -> None:
     """Draws a cell; nothing where it has no range edge."""
     if shifts.edges[place] == 0:
         return
@@ -295,14 +327,15 @@ def _cell(view: Pixels, shifts: LocalShifts, place: tuple[int, int], end_px: flo
     (top, bottom), (left, right) = ends
     cell = Rectangle(left, top, right - left, bottom - top)
     sides = Rectangle(left, top, right - left + 1, bottom - top + 1)  # shared with the next cells
-    middle = np.array([0.5 * (left + right), top + 0.35 * cell.height])
+    middle = np.array([0.5 * (left + right), top + 0.3 * cell.height])
     figures, ink = [str(shifts.edges[place])], drawing.GREY
     if shifts.known[place]:
-        length, ink = float(shifts.size_px[place]), drawing.BLACK
-        figures.insert(0, f"{length:.1f} px")
-        drawing.tint(view, cell, drawing.colours(length / end_px), COVER)
+        length, ink = float(np.nan_to_num(shifts.size_deg[place])), drawing.BLACK
+        figures[:0] = [f"{number(float(shifts.size_deg[place]), 2)}°", f"{shifts.size_px[place]:.1f} px"]
+        drawing.tint(view, cell, drawing.colours(length / end_deg), COVER)
         drawing.outline(view, sides, drawing.WHITE)
-        head = middle + ARROW_SHARE * min(cell.width, cell.height) / max(end_px, length) * shifts.shift_px[place]
+        way = shifts.shift_px[place] / max(float(shifts.size_px[place]), 1e-9)
+        head = middle + ARROW_SHARE * min(cell.width, cell.height) * length / max(end_deg, length) * way
         drawing.arrow(view, middle, head, TIP_PX, ((drawing.WHITE, 5), (drawing.BLACK, 2)))
     else:
         drawing.outline(view, sides, drawing.WHITE)
