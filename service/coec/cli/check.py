@@ -16,8 +16,13 @@ if TYPE_CHECKING:
     from coec.reports.console import StageTimes
     from coec.reports.recording_fitness import Cadence, Fitness, Notice
 
-PAIRS = 6
-"""Pairs of the trial, evenly chosen: as many as in a check of the monitor."""
+PAIRS = 12
+"""Most pairs of the trial, evenly chosen: half as many as a calibration takes."""
+
+REFUSES, MAY_REFUSE = "calibrate will refuse this, because ", "calibrate may refuse this, because "
+
+TOO_FEW = "too_few_frames"
+"""Code of the remark that a trial of the same few frames outweighs if it is accepted."""
 
 LEVEL_STYLES = {"fail": "bold red", "warn": "bold yellow", "ok": ""}
 
@@ -27,10 +32,12 @@ def check(
     depth: Depth = None,
     as_json: Json = False,
 ) -> int:
-    """Show the content of a recording and whether it is suitable: exit 1 if it allows no calibration."""
+    """Show the content of a recording and predict the verdict: exit 1 if a calibration is impossible or refused."""
+    from coec.calibration.monitor.check_verdict import MIN_PAIRS
     from coec.io.recordings.layouts import open_source
     from coec.reports import console
     from coec.reports.console import StageTimes
+    from coec.reports.formatting import count
     from coec.reports.recording_fitness import fitness_of
 
     try:
@@ -43,14 +50,18 @@ def check(
         times = StageTimes(bars)
         seen = fitness_of(recording)
         times.step("examine", 1, 1)
-        failed = any(note.level == "fail" for note in seen.remarks)
+        failed = any(note.level == "fail" and note.code != TOO_FEW for note in seen.remarks)
         trial = None if failed else _trial(recording, depth, times)
-    notes = (*seen.remarks, *_of_trial(trial))
+    if _is_accepted(trial):
+        enough = f"{count(seen.camera.frames, 'camera frame')} suffice here; a check by the service needs {MIN_PAIRS}."
+        remarks = (replace(n, level="warn", text=enough) if n.code == TOO_FEW else n for n in seen.remarks)
+        seen = replace(seen, remarks=tuple(remarks))
+    notes = (*seen.remarks, *_of_trial(trial, seen))
     if as_json:
-        console.print_json(_document(source, replace(seen, remarks=notes), trial))
+        console.print_json(_document(source, replace(seen, remarks=_ordered(notes)), trial))
     else:
-        _show(recording.name, replace(seen, remarks=notes), trial)
-    return int(failed or isinstance(trial, CalibrationError))
+        _show(recording.name, replace(seen, remarks=_ordered(notes)), trial)
+    return int(any(note.level == "fail" for note in notes))
 
 
 def _trial(recording: RecordingSource, depth: str | None, times: StageTimes) -> Estimate | CalibrationError:
@@ -71,21 +82,48 @@ def _trial(recording: RecordingSource, depth: str | None, times: StageTimes) -> 
         return error
 
 
-def _of_trial(trial: Estimate | CalibrationError | None) -> tuple[Notice, ...]:
-    from coec.reports.recording_fitness import Notice
+def _of_trial(trial: Estimate | CalibrationError | None, seen: Fitness) -> tuple[Notice, ...]:
+    """What the trial says of a calibration: for what it will be refused, and what a longer window may remedy."""
+    from coec.reports.recording_fitness import Notice, pairs_of_calibration, reasons_that_stay
 
     if isinstance(trial, CalibrationError):
-        return (Notice("fail", "no_calibration", str(trial)),)
+        return (Notice("fail", "no_calibration", f"{REFUSES}{trial}"),)
     if trial is None:
         return ()
-    return tuple(Notice("warn", reason.code, reason.text) for reason in trial.verdict.reasons)
+    staying = reasons_that_stay(trial, pairs_of_calibration(seen))
+    others = (reason for reason in trial.verdict.reasons if reason not in staying)
+    return (
+        *(
+            Notice("fail", reason.code, f"{'and because ' if rank else REFUSES}{reason.text}")
+            for rank, reason in enumerate(staying)
+        ),
+        *(Notice("warn", reason.code, f"{MAY_REFUSE}{reason.text}") for reason in others),
+    )
+
+
+def _ordered(notes: tuple[Notice, ...]) -> tuple[Notice, ...]:
+    """The most important first."""
+    return tuple(sorted(notes, key=lambda note: list(LEVEL_STYLES).index(note.level)))
+
+
+def _prediction(seen: Fitness, trial: Estimate | CalibrationError | None) -> str:
+    """`refused`, `accepted`, or `unclear`: the verdict of a calibration, as far as the trial tells."""
+    if any(note.level == "fail" for note in seen.remarks):
+        return "refused"
+    return "accepted" if _is_accepted(trial) else "unclear"
+
+
+def _is_accepted(trial: Estimate | CalibrationError | None) -> bool:
+    from coec.calibration.types import Decision, Estimate
+
+    return isinstance(trial, Estimate) and trial.verdict.decision is Decision.ACCEPTED
 
 
 def _document(source: str, seen: Fitness, trial: Estimate | CalibrationError | None) -> dict[str, Any]:
     from coec.calibration.types import Estimate
     from coec.io.serialise import degrees_or_null
 
-    document = {"source": source, **asdict(seen), "trial": None}
+    document = {"source": source, **asdict(seen), "prediction": _prediction(seen, trial), "trial": None}
     if isinstance(trial, Estimate):
         document["trial"] = {
             "pairs": trial.pairs,

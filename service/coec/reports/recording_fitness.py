@@ -3,8 +3,10 @@
 The stamps of all frames are known without loading them; only a few frames, evenly chosen, are loaded.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import isfinite
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -12,7 +14,17 @@ from numpy.typing import NDArray
 
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.monitor.check_verdict import MIN_PAIRS
-from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Rig
+from coec.calibration.types import (
+    INTRINSICS_OFF,
+    MOVED,
+    CameraFrame,
+    EgoMotion,
+    Estimate,
+    FramePair,
+    LidarFrame,
+    Reason,
+    Rig,
+)
 from coec.config import PairingConfig, WindowConfig
 from coec.geometry.cameras import in_image
 from coec.geometry.points import lengths
@@ -161,6 +173,52 @@ def fitness_of(recording: RecordingSource) -> Fitness:
         remarks=(),
     )
     return _with_remarks(seen)
+
+
+def pairs_of_calibration(seen: Fitness) -> int:
+    """How many pairs `coec calibrate` finds in a recording, about."""
+    return round(seen.paired * min(seen.camera.frames, WindowConfig().pairs))
+
+
+_GAIN: Mapping[str, float] = MappingProxyType(
+    {
+        "range_edges": 1.0,
+        "edge_contrast": 0.5,
+        "edges_once": 0.5,
+        "mi_over_unrelated": 0.5,
+        "runner_up": -0.5,
+        "sigma_deg": -1.0,
+        "sigma_m": -1.0,
+        INTRINSICS_OFF: -0.5,
+        MOVED: -0.5,
+    }
+)
+"""The power of the number of pairs with which a figure changes at best: if every pair is independent, no error is
+common to all, and what contradicts the rig does so by chance. σ falls faster than by the root, because few pairs hardly
+show how far they scatter. Figures that are not listed stay as they are. See docs/measured.md."""
+
+
+CLOSE = 1.1
+"""A figure within this factor of its limit may be on the other side of it from another start."""
+
+
+def reasons_that_stay(trial: Estimate, pairs: int) -> tuple[Reason, ...]:
+    """The reasons for which a trial was refused that would refuse a calibration of so many `pairs` of the same
+    recording, too, from any start and even if each pair more were as good as any."""
+    times = max(pairs / trial.pairs, 1.0)
+    metrics = {metric.name: metric for metric in trial.verdict.metrics}
+
+    def stays(code: str) -> bool:
+        metric = metrics.get(code)
+        if metric is None or not isfinite(metric.value):
+            return times == 1.0
+        at_best = metric.value * times ** _GAIN.get(code, 0.0)
+        return not replace(metric, value=at_best * CLOSE if metric.at_least else at_best / CLOSE).passed
+
+    # That a window needs motion is said of the others.
+    staying = tuple(reason for reason in trial.verdict.reasons if reason.code != "motion" and stays(reason.code))
+    advice = tuple(reason for reason in trial.verdict.reasons if reason.code == "motion")
+    return (*staying, *advice) if staying else ()
 
 
 def cadence(stamps_ns: Sequence[int]) -> Cadence:
