@@ -106,7 +106,7 @@ TO_JSON = f'coec calibrate "kitti360:{SAMPLES}/kitti360?camera=image_00" --depth
 COMMISSION = "coec commission SOURCE... --output rig.json"
 DIAGNOSE = "coec diagnose SOURCE --rig rig.json"
 ASSESS = "coec models assess network.onnx SOURCE --output DIR"
-CHECK = f'coec check "kitti360:{SAMPLES}/kitti360?camera=image_00" --depth stereo'
+CHECK = f'coec check "kitti360:{SAMPLES}/kitti360?camera=image_00"'
 NETWORK = f"{SAMPLES}/depth/tcsmallnet_dyn.onnx"
 
 FORMS = {
