@@ -40,7 +40,7 @@ from coec.reports.formatting import count
 from coec.reports.overlay import titled
 from coec.reports.recording_fitness import Cadence, cadence
 from coec.schemas.message import to_json
-from coec.schemas.replies import CalibrationResult, MetricReply, Reason, Verdict
+from coec.schemas.replies import CalibrationResult, Lens, MetricReply, Reason, Verdict
 from coec.untrusted import Untrusted, printable
 
 NS_PER_S = 1e9
@@ -284,6 +284,12 @@ class Result:
     def camera_fit(self) -> CameraFit | None:
         """How well the chosen `camera_model` fits the recording's camera; None if none was chosen."""
         return self._solution.fit
+
+    @property
+    def lens(self) -> Lens | None:
+        """Focal length, principal point and first radial term as the window has them, with standard deviations; None
+        with an objective without edges, or if the edges determine no pose. Nothing applies it."""
+        return self.document.lens
 
     @property
     def time_offset(self) -> TimeOffset | None:

@@ -17,6 +17,7 @@ from coec.io import user_files
 from coec.io.depth.depth_maps import open_depth
 from coec.io.images import encode_png
 from coec.io.recordings.window_cutting import evenly_spread, parse_perturbation
+from golden.scene import Drive, write
 
 TOLERANCE_DEG = 0.35
 
@@ -138,6 +139,20 @@ def test_fitted_double_sphere_reports_its_residual(coec: Coec, tmp_path: Path) -
     fit = outcome.document["camera_fit"]
     assert fit["model"] == "double_sphere"
     assert 0 <= fit["residual_rms_px"] <= fit["residual_max_px"] < 1e-6
+
+
+def test_the_lens_is_reported_on_request(coec: Coec, tmp_path: Path) -> None:
+    drive = write(Drive(), tmp_path / "drive")
+    shown = coec("calibrate", drive, "--depth", "stereo", "--intrinsics", "--output", tmp_path / "out").out
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert result["lens"]["estimated"].keys() == {"fx", "fy", "cx", "cy"}
+    assert abs(result["lens"]["focal_length"]["difference"]) < 3.0 * result["lens"]["focal_length"]["sigma"]
+    assert "radial, at a corner" in shown
+    assert "radial, at a corner" in (tmp_path / "out" / "report.html").read_text()
+    assert result["intrinsics"]["sha256"] in (tmp_path / "out" / "report.html").read_text()
+    without = coec("calibrate", drive, "--depth", "stereo", "--objective", "mi", "--intrinsics").out
+    assert "The lens was not estimated" in without
+    assert "radial" not in coec("calibrate", drive, "--depth", "stereo", "--objective", "mi").out
 
 
 def test_frames_bounds_the_window(coec: Coec) -> None:

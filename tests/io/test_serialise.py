@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from coec.calibration.types import (
     Decision,
     Estimate,
+    LensEstimate,
     Metric,
     MovedWithin,
     Optimum,
@@ -25,7 +26,7 @@ from coec.calibration.types import (
 from coec.errors import DecodeError
 from coec.geometry.cameras import build
 from coec.geometry.se3 import perturbation
-from coec.io.serialise import comparable, estimate_of, matrix_of, result_of, transform_of
+from coec.io.serialise import comparable, estimate_of, intrinsics_of, matrix_of, result_of, transform_of
 from coec.schemas.message import from_json, from_msgpack, to_json, to_msgpack
 from coec.schemas.replies import CalibrationResult
 from coec.schemas.replies import StopReason as TheirReason
@@ -89,6 +90,37 @@ def test_a_move_within_the_window_travels_with_the_result() -> None:
     read = from_json(CalibrationResult, to_json(result_of(sent, RIG, "truck-7")))
     assert same(estimate_of(read).moved, moved)
     assert estimate_of(result_of(estimate(), RIG, "truck-7")).moved is None
+
+
+def test_the_lens_travels_with_the_result() -> None:
+    values = np.random.default_rng(4).normal(size=(4, 4))
+    lens = LensEstimate(values[0], values[1], values[2], values[3], np.array([True, False, True, False]), 0.25)
+    reply = result_of(estimate(lens=lens), RIG, "truck-7")
+    assert reply.lens is not None
+    assert reply.lens.estimated["cx"] == 319.5 + values[0, 0]
+    assert reply.lens.estimated["fx"] == 500.0 * (1.0 + values[0, 2])
+    assert (reply.lens.focal_length.unit, reply.lens.focal_length.free_sigma) == ("share", values[3, 2])
+    assert (reply.lens.principal_point_y.determined, reply.lens.radial.difference) == (False, values[0, 3])
+    read = estimate_of(from_json(CalibrationResult, to_json(reply)))
+    assert same(read.lens, lens)
+    assert to_json(result_of(read, RIG, "truck-7")) == to_json(reply)
+
+
+def test_a_result_of_an_earlier_version_has_no_lens_and_no_hash_which_is_no_difference() -> None:
+    one = np.ones(4)
+    lens = LensEstimate(one, one, one, one, np.ones(4, np.bool_), 0.25)
+    reached = result_of(estimate(lens=lens), RIG, "truck-7")
+    document = json.loads(to_json(reached))
+    del document["lens"], document["intrinsics"]["sha256"]
+    recorded = from_json(CalibrationResult, json.dumps(document).encode())
+    assert estimate_of(recorded).lens is None
+    assert to_json(comparable(reached, recorded)) == to_json(recorded)
+
+
+def test_the_hash_of_intrinsics_names_them() -> None:
+    same_again = build("pinhole", width=640, height=480, fx=500.0, fy=500.0, cx=319.5, cy=239.5)
+    assert intrinsics_of(RIG.camera).sha256 == intrinsics_of(same_again).sha256
+    assert intrinsics_of(RIG.camera).sha256 != intrinsics_of(RIG.camera._replace(cx=319.0)).sha256
 
 
 def test_a_result_of_an_earlier_version_is_the_same_decision_without_intrinsics() -> None:

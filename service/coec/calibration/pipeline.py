@@ -6,6 +6,7 @@ import numpy as np
 
 from coec.calibration import verdict
 from coec.calibration.frames.motion_compensation import compensation
+from coec.calibration.lens import estimate_lens
 from coec.calibration.search.change_point import change_point, moved_within
 from coec.calibration.solver import prepare_window_data, solve
 from coec.calibration.types import (
@@ -80,4 +81,5 @@ def calibrate(
             config.objective, config.search, config.verdict, str(config.motion_compensation), depth.identity
         ),
         moved=moved,
+        lens=estimate_lens(optimum.posterior, window.rig.camera),
     )

@@ -457,6 +457,34 @@ class MovedWithin:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class LensEstimate:
+    """What a window says of the lens, as differences from the intrinsics of its rig: principal point right and down,
+    px; focal length, as a share of it; first radial term, px at a corner of the image.
+
+    Attributes:
+        difference, sigma: (4,) and standard deviations, by the window and by what is known of the intrinsics.
+        free_difference, free_sigma: (4,) likewise by the window alone, whatever the intrinsics are.
+        determined: (4,) bool, what the window alone determines.
+        probability: that the images were taken through another lens than the intrinsics say.
+    """
+
+    difference: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    free_difference: NDArray[np.float64]
+    free_sigma: NDArray[np.float64]
+    determined: NDArray[np.bool_]
+    probability: float
+
+    def corrected(self, camera: Camera) -> Camera:
+        """The camera of the rig with focal length and principal point as estimated. Its radial terms stay: no model has
+        the first one as a parameter that is independent of the others."""
+        right, down, longer, _ = self.difference.tolist()
+        return camera._replace(
+            fx=camera.fx * (1.0 + longer), fy=camera.fy * (1.0 + longer), cx=camera.cx + right, cy=camera.cy + down
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """The immutable result of calibrating one window.
 
@@ -470,6 +498,7 @@ class Estimate:
         depth_identity: sha256 of the network, or `precomputed`.
         config_hash: of everything that decides the result.
         moved: the move for which the window was refused; None if the camera did not move within it.
+        lens: what the window says of the lens; None if its objective uses no edges, or they determine no pose.
     """
 
     window_id: str
@@ -485,6 +514,7 @@ class Estimate:
     depth_identity: str
     config_hash: str
     moved: MovedWithin | None = None
+    lens: LensEstimate | None = None
 
     @property
     def sigma(self) -> NDArray[np.float64]:

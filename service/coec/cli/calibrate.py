@@ -29,6 +29,14 @@ def calibrate(
             metavar="DIR",
         ),
     ] = None,
+    intrinsics: Annotated[
+        bool,
+        typer.Option(
+            "--intrinsics",
+            help="Also show focal length, principal point and radial distortion as the window has them, with σ. In "
+            "JSON they are always there (`lens`).",
+        ),
+    ] = False,
     as_json: Json = False,
     **options: Unpack[CalibrationOptions],
 ) -> int:
@@ -57,7 +65,7 @@ def calibrate(
     not_written = None
     if output is not None:
         try:
-            written, left_out = _write(output, loaded.window.rig.camera, solution, document)
+            written, left_out = _write(output, loaded.window.rig.camera, solution, document, intrinsics=intrinsics)
         except OutputError as error:
             not_written = error
             document["not_written"] = str(error)
@@ -71,6 +79,7 @@ def calibrate(
             camera_fit=document.get("camera_fit"),
             time_offset=document.get("time_offset"),
             elapsed_s=document["elapsed_s"],
+            intrinsics=intrinsics,
         )
     if not_written is not None:
         console.say(f"coec: {not_written}")
@@ -117,7 +126,7 @@ def _finite(value: float) -> float | None:
 
 
 def _write(
-    folder: Path, camera: Camera, solution: Solution, document: dict[str, Any]
+    folder: Path, camera: Camera, solution: Solution, document: dict[str, Any], *, intrinsics: bool
 ) -> tuple[list[Path], tuple[str, ...]]:
     """Writes the files; returns their paths, and what was left out. `camera` is the recording's, to which another may
     have been fitted."""
@@ -150,7 +159,9 @@ def _write(
     report = CalibrationReport.model_validate(document)
     written = files.write_output(folder / "result.json", to_json(report))
     remarks = calibration.remarks(document.get("camera_fit"), document.get("time_offset"))
-    of_result = calibration_page(report, window, calibration.start_of(window), blocks, remarks, Provenance.here())
+    of_result = calibration_page(
+        report, window, calibration.start_of(window), blocks, remarks, Provenance.here(), intrinsics=intrinsics
+    )
     return [*paths, written, page.write(folder / "report.html", of_result)], comparison.left_out
 
 

@@ -26,8 +26,8 @@ import coec
 from coec.config import CameraIntrinsics
 from coec.errors import OutputError
 from coec.geometry import cameras, se3
-from coec.io.rig_files import intrinsics_config
-from coec.io.serialise import estimate_of, matrix_of, number_or_null
+from coec.io.rig_files import camera_of, intrinsics_config
+from coec.io.serialise import estimate_of, intrinsics_of, matrix_of, number_or_null
 from coec.schemas.replies import CalibrationResult, ExtrinsicReply, Intrinsics
 
 Matrix = NDArray[np.float64]
@@ -99,6 +99,11 @@ class ExportedExtrinsic:
         """(4, 4) pose in the parent of the camera's body frame (x forward, y left, z up; REP 103)."""
         return self.T_parent_child @ T_OPTICAL_BODY
 
+    @property
+    def intrinsics(self) -> Intrinsics | None:
+        """Those of `camera`, with their hash: the pose holds for them alone."""
+        return None if self.camera is None else intrinsics_of(camera_of(self.camera))
+
     def remarks(self, direction: str) -> list[str]:
         """Comment lines for a file: the direction of its numbers in words, their uncertainty and their origin."""
         origin = self.origin
@@ -108,6 +113,7 @@ class ExportedExtrinsic:
             direction,
             self._sigma_line(),
             f"covariance of the error (rad, m; about the camera axes, row by row): {_numbers(self.covariance.ravel())}",
+            *self._intrinsics_lines(),
         ]
         if origin.window_id is not None:
             lines.append(
@@ -126,6 +132,7 @@ class ExportedExtrinsic:
             "vehicle": origin.vehicle,
             "pair": origin.pair,
             "provenance": origin.provenance,
+            "intrinsics": None if self.intrinsics is None else self.intrinsics.model_dump(mode="json"),
             "window_id": origin.window_id,
             "data_stamp_ns": origin.data_stamp_ns,
             "config_hash": origin.config_hash,
@@ -139,6 +146,16 @@ class ExportedExtrinsic:
             return []
         refused = "" if self.origin.provenance == "nominal" else f"{REFUSED}. "
         return [f"{refused}NOT ACCEPTED, exported by force: {' '.join(reasons)}"]
+
+    def _intrinsics_lines(self) -> list[str]:
+        """The intrinsics to which the pose belongs; nothing if they are not known."""
+        lens = self.intrinsics
+        if lens is None:
+            return []
+        parameters = " ".join(f"{name} {value!r}" for name, value in lens.parameters.items())
+        return [
+            f"holds with the intrinsics {lens.model} {lens.width} x {lens.height} {parameters}; sha256 {lens.sha256}"
+        ]
 
     def _sigma_line(self) -> str:
         sigma = np.sqrt(self.covariance.diagonal())

@@ -1,10 +1,12 @@
 """Converts estimates to wire models and back. A round trip gives the same bytes, so that the result that one process
 solves is exactly the one that another serves, stores or replays."""
 
+import hashlib
+import json
 import math
 import sys
-from collections.abc import Iterable
-from typing import cast
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +16,7 @@ from coec.calibration.state import PairState
 from coec.calibration.types import (
     Decision,
     Estimate,
+    LensEstimate,
     Matrix4,
     Metric,
     MovedWithin,
@@ -48,11 +51,55 @@ def intrinsics_of(camera: cameras.Camera) -> replies.Intrinsics:
     """The wire form of a camera; its numbers are the same doubles."""
     parameters = cameras.intrinsics_of(camera)
     width, height = int(parameters.pop("width")), int(parameters.pop("height"))
-    return replies.Intrinsics(
-        model=cameras.name_of(camera),
-        width=width,
-        height=height,
-        parameters={name: float(value) for name, value in parameters.items()},
+    document: dict[str, Any] = {
+        "model": cameras.name_of(camera),
+        "width": width,
+        "height": height,
+        "parameters": {name: float(value) for name, value in parameters.items()},
+    }
+    canonical = json.dumps(document, sort_keys=True, separators=(",", ":"))
+    return replies.Intrinsics(**document, sha256=hashlib.sha256(canonical.encode()).hexdigest())
+
+
+_LENS_TERMS: Mapping[str, Literal["px", "share"]] = {
+    "principal_point_x": "px",
+    "principal_point_y": "px",
+    "focal_length": "share",
+    "radial": "px",
+}
+"""Unit of each term of the wire form of a `LensEstimate`, in its order."""
+
+
+def lens_of(lens: LensEstimate, camera: cameras.Camera) -> replies.Lens:
+    """The wire form of what a window says of the lens of a camera; its differences are the same doubles."""
+    terms = {
+        name: replies.LensTerm(
+            unit=unit,
+            difference=float(lens.difference[place]),
+            sigma=float(lens.sigma[place]),
+            free_difference=float(lens.free_difference[place]),
+            free_sigma=float(lens.free_sigma[place]),
+            determined=bool(lens.determined[place]),
+        )
+        for place, (name, unit) in enumerate(_LENS_TERMS.items())
+    }
+    estimated = lens.corrected(camera)
+    return replies.Lens(
+        **terms,
+        probability=lens.probability,
+        estimated={name: float(getattr(estimated, name)) for name in ("fx", "fy", "cx", "cy")},
+    )
+
+
+def _lens_estimate(lens: replies.Lens) -> LensEstimate:
+    terms: list[replies.LensTerm] = [getattr(lens, name) for name in _LENS_TERMS]
+    return LensEstimate(
+        difference=np.array([term.difference for term in terms]),
+        sigma=np.array([term.sigma for term in terms]),
+        free_difference=np.array([term.free_difference for term in terms]),
+        free_sigma=np.array([term.free_sigma for term in terms]),
+        determined=np.array([term.determined for term in terms]),
+        probability=lens.probability,
     )
 
 
@@ -101,14 +148,20 @@ def result_of(estimate: Estimate, rig: Rig, vehicle: str) -> replies.Calibration
         config_hash=estimate.config_hash,
         moved=None if estimate.moved is None else _moved_of(estimate.moved),
         intrinsics=intrinsics_of(rig.camera),
+        lens=None if estimate.lens is None else lens_of(estimate.lens, rig.camera),
     )
 
 
 def comparable(reached: replies.CalibrationResult, recorded: replies.CalibrationResult) -> replies.CalibrationResult:
     """`reached` with the schema version of `recorded`, for a comparison byte by byte: a recording by an earlier version
-    of the program holds that version, and may lack the intrinsics, which is no difference in the decision."""
+    of the program holds that version, and may lack intrinsics, their hash or the lens, which is no difference in the
+    decision."""
     intrinsics = None if recorded.intrinsics is None else reached.intrinsics
-    return reached.model_copy(update={"schema_version": recorded.schema_version, "intrinsics": intrinsics})
+    if recorded.intrinsics is not None and recorded.intrinsics.sha256 is None and intrinsics is not None:
+        intrinsics = intrinsics.model_copy(update={"sha256": None})
+    lens = None if recorded.lens is None else reached.lens
+    changes = {"schema_version": recorded.schema_version, "intrinsics": intrinsics, "lens": lens}
+    return reached.model_copy(update=changes)
 
 
 def _moved_of(moved: MovedWithin) -> replies.MovedWithin:
@@ -159,6 +212,7 @@ def estimate_of(result: replies.CalibrationResult) -> Estimate:
         depth_identity=result.depth_identity,
         config_hash=result.config_hash,
         moved=None if result.moved is None else _moved_within(result.moved),
+        lens=None if result.lens is None else _lens_estimate(result.lens),
     )
 
 

@@ -12,7 +12,7 @@ from coec.geometry import se3
 from coec.geometry.points import distinct_rings
 from coec.io.depth.depth_maps import STEREO
 from coec.io.exported_extrinsic import REFUSED
-from coec.reports import console, page_parts
+from coec.reports import console, lens_report, page_parts
 from coec.reports.formatting import count, number, percent, second, significant, size
 from coec.reports.page import AxesTable, Block, Facts, Page, Section, Text, VerdictBanner
 from coec.schemas.replies import CalibrationReport, CalibrationResult, Transform, Vector6
@@ -39,6 +39,7 @@ def show(
     camera_fit: Mapping[str, Any] | None,
     time_offset: Mapping[str, Any] | None,
     elapsed_s: Mapping[str, float],
+    intrinsics: bool = False,
 ) -> None:
     """Prints the result of a window.
 
@@ -47,6 +48,7 @@ def show(
         configuration: with which it was calibrated.
         camera_fit, time_offset: as `--json` has them; None: not asked for.
         elapsed_s: seconds by stage.
+        intrinsics: whether the lens is shown, too.
     """
     console.show(f"{window.window_id}: {count(result.pairs, 'pair')}, {result.points_in_view} points in view")
     _show_axes(window, result)
@@ -56,6 +58,8 @@ def show(
     show_pose(
         result.camera_from_lidar, result.lidar_frame, result.camera_frame, warning="" if _accepted(result) else REFUSED
     )
+    if intrinsics:
+        lens_report.show(result.lens, result.intrinsics)
     console.show(settings_text(configuration, result.depth_identity))
     console.show(compensation_text(result.compensation))
     if any(pair.lidar.ring is not None and distinct_rings(pair.lidar.ring) is None for pair in window.pairs):
@@ -180,6 +184,8 @@ def calibration_page(
     pictures: Sequence[Block],
     remarks: Sequence[str],
     made: page_parts.Provenance,
+    *,
+    intrinsics: bool = False,
 ) -> Page:
     """The page of a result.
 
@@ -187,10 +193,12 @@ def calibration_page(
         start: of the search, relative to the recording's own calibration: rx ry rz (deg), tx ty tz (m).
         pictures: of the result.
         remarks: what else was found out, one sentence each.
+        intrinsics: whether the lens has a section.
     """
     sections = (
         Section("Result", (_axes(report, start), *(Text((each,)) for each in remarks))),
         _copies(report),
+        *((lens_report.section(report.lens, report.intrinsics),) if intrinsics else ()),
         *((Section("Pictures", tuple(pictures)),) if pictures else ()),
         Section(
             "Why it was " + ("accepted" if _accepted(report) else "refused"),
@@ -292,6 +300,7 @@ def _origin(report: CalibrationReport, window: Window) -> tuple[tuple[str, str],
         ("Window", report.window_id),
         ("Sensor time", f"{second(first)} to {second(last)}"),
         ("Window, sha256 of images, points and stamps", page_parts.content_hash(window)),
+        *page_parts.intrinsics_items(report.intrinsics),
         *page_parts.depth_items(report.depth_identity),
         ("Configuration, hash", report.config_hash),
     )

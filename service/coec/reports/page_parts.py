@@ -44,7 +44,7 @@ from coec.reports.page import (
     Section,
     Tone,
 )
-from coec.schemas.replies import Maybe6, MetricReply, Reason, Transform
+from coec.schemas.replies import Intrinsics, Maybe6, MetricReply, Reason, Transform
 
 TONES: Mapping[str, Tone] = {
     "accepted": "good",
@@ -337,6 +337,17 @@ def depth_items(identity: str) -> tuple[tuple[str, str], ...]:
         return (("Depth", "precomputed: the maps of the source"),)
     name = next((card.name for card in built_in_cards().values() if card.sha256 == identity), "a network of your own")
     return (("Depth network", name), ("Depth network, sha256", identity))
+
+
+def intrinsics_items(lens: Intrinsics | None) -> tuple[tuple[str, str], ...]:
+    """The intrinsics for which an extrinsic holds."""
+    if lens is None:
+        return ()
+    parameters = ", ".join(f"{name} {significant(value, 6)}" for name, value in lens.parameters.items())
+    return (
+        ("Holds with the intrinsics", f"{lens.model}, {lens.width} × {lens.height} px, {parameters}"),
+        *((("Intrinsics, sha256", lens.sha256),) if lens.sha256 else ()),
+    )
 
 
 def content_hash(window: Window) -> str:

@@ -10,7 +10,7 @@ from typing import Final
 from rich.table import Table
 from rich.text import Text
 
-from coec.reports import console
+from coec.reports import console, lens_report
 from coec.reports.formatting import count, hold_text, second
 from coec.schemas import replies, rig_state
 from coec.schemas.message import from_json
@@ -156,6 +156,11 @@ def extrinsic(payload: bytes) -> None:
                 "  step "
                 + "  ".join(f"{name} {v:+.3f}" for name, v in zip(console.AXES, reply.pending.step, strict=True))
             )
+    if reply.intrinsics is not None:
+        lens = reply.intrinsics
+        parameters = "  ".join(f"{name} {value:.6g}" for name, value in lens.parameters.items())
+        named = "" if lens.sha256 is None else f"  sha256 {lens.sha256[:16]}"
+        console.show(f"holds with the intrinsics {lens.model} {lens.width} x {lens.height}  {parameters}{named}")
     if reply.data_stamp_ns is not None:
         console.show(f"from window {reply.window_id}, data until {second(reply.data_stamp_ns)}")
 
@@ -180,6 +185,8 @@ def health(payload: bytes) -> None:
             f"{name} {console.figure(value, sign=True)}" for name, value in zip(console.AXES, reply.drift, strict=True)
         )
         console.show(f"drift from commissioned (deg, m): {drift}")
+    if reply.intrinsics is not None:
+        console.show(f"lens from configured: {lens_report.drift_text(reply.intrinsics)}")
     quality = reply.data_quality
     known = {
         "pairs per second": quality.pair_rate_hz,

@@ -60,6 +60,42 @@ class Intrinsics(Part):
     parameters: dict[Text, float] = Field(
         description="fx fy cx cy (px; pixel centres at integers), and the parameters of the model by name"
     )
+    sha256: Text | None = Field(
+        default=None,
+        description="of the canonical JSON of the other fields: names the intrinsics; null: the writer is of an "
+        "earlier version",
+    )
+
+
+class LensTerm(Part):
+    """A number of the lens, as a difference from the intrinsics of the camera."""
+
+    unit: Literal["px", "share"] = Field(description="`share`: of the value in the intrinsics, 0.01 is 1 %")
+    difference: float = Field(description="by the window and by what is known of the intrinsics")
+    sigma: float = Field(description="standard deviation of `difference`")
+    free_difference: float = Field(description="by the window alone, whatever the intrinsics are")
+    free_sigma: float = Field(description="standard deviation of `free_difference`")
+    determined: bool = Field(description="whether the window alone determines it")
+
+
+class Lens(Part):
+    """What a window says of the lens. It is reported, and applied by nobody but a person."""
+
+    focal_length: LensTerm
+    principal_point_x: LensTerm = Field(description="to the right")
+    principal_point_y: LensTerm = Field(description="down")
+    radial: LensTerm = Field(description="first radial term: displacement of a corner of the image outwards")
+    probability: float = Field(
+        description="that the images were taken through another lens than the intrinsics say, 0 to 1"
+    )
+    estimated: dict[Text, float] = Field(description="fx fy cx cy with these differences, px")
+
+
+class LensDrift(Lens):
+    """The lens according to the latest window, against the configured intrinsics."""
+
+    window_id: Text
+    data_stamp_ns: int = Field(description="stamp of the last contributing pair, ns")
 
 
 class Reason(Part):
@@ -176,6 +212,11 @@ class CalibrationResult(Message):
     )
     intrinsics: Intrinsics | None = Field(
         default=None, description="those of the camera that it holds for; null: the writer is of an earlier version"
+    )
+    lens: Lens | None = Field(
+        default=None,
+        description="what the window says of the lens; null: the objective uses no edges, or they determine no pose, "
+        "or the writer is of an earlier version",
     )
 
 
@@ -332,6 +373,10 @@ class HealthReply(Message):
     evaluated_ns: int | None = Field(description="stamp of the last evaluated pair, ns; null before the first window")
     age_s: float | None = Field(description="age of the last evaluated window; null before the first")
     alarms: Alarms | None = Field(default=None, description="its alarms by outcome; null while the pair is incomplete")
+    intrinsics: LensDrift | None = Field(
+        default=None,
+        description="drift of the lens of the latest window from the configured intrinsics; null: no window tells",
+    )
 
 
 Book = Literal["results", "states", "commands"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shlex
 import subprocess
 from collections.abc import Callable
@@ -18,9 +19,12 @@ from hypothesis import given, strategies
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
+from coec.config import CameraIntrinsics
 from coec.errors import OutputError
 from coec.io.exported_extrinsic import roll_pitch_yaw
 from coec.io.exports import formats
+from coec.io.ros.camera_info import info_of_yaml, intrinsics_of_info
+from golden.scene import LENSES
 from support.estimates import exported_extrinsic
 
 Matrix = NDArray[np.float64]
@@ -128,6 +132,12 @@ def read_json(text: str) -> Matrix:
     return np.array(json.loads(text)["T_child_parent"])
 
 
+def read_camera_info(text: str) -> Matrix:
+    line = next(line for line in text.splitlines() if line.startswith("# cam0 in base_link: "))
+    translation, quaternion = (json.loads(part) for part in re.findall(r"\[.*?\]", line))
+    return inverse(pose(rotation_of([quaternion[3], *quaternion[:3]]), translation))
+
+
 READERS: dict[str, Callable[[str], Matrix]] = {
     "tf": read_tf,
     "urdf": read_urdf,
@@ -140,6 +150,7 @@ READERS: dict[str, Callable[[str], Matrix]] = {
     "colmap": read_colmap,
     "opencv": read_opencv,
     "json": read_json,
+    "ros_camera_info": read_camera_info,
 }
 
 TURNS = strategies.lists(strategies.floats(-3.0, 3.0), min_size=6, max_size=6).map(np.array)
@@ -166,6 +177,37 @@ def test_every_file_says_direction_spread_and_origin(name: str) -> None:
     assert any(word in text for word in ("pose", "maps", "p_camera"))
     assert "NOT ACCEPTED" not in text
     assert '"accepted": false' not in text
+
+
+@pytest.mark.parametrize("name", formats())
+def test_every_file_says_with_which_intrinsics_it_holds(name: str) -> None:
+    exported = exported_extrinsic(np.zeros(6))
+    assert exported.intrinsics is not None
+    assert exported.intrinsics.sha256 is not None
+    text = formats()[name].text(exported, None)
+    assert exported.intrinsics.sha256 in text
+    assert "700.5" in text
+    if name not in ("kalibr", "ros_camera_info"):
+        assert "sha256" not in formats()[name].text(exported_extrinsic(np.zeros(6), camera=None), None)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_camera_info_is_read_back_to_the_same_lens(lens: str) -> None:
+    camera = CameraIntrinsics(model=lens, width=240, height=160, **LENSES[lens])
+    content = info_of_yaml(
+        YAML(typ="safe").load(formats()["ros_camera_info"].text(exported_extrinsic(np.zeros(6), (), camera), None))
+    )
+    assert content is not None
+    read = intrinsics_of_info(content, rectified=False).intrinsics
+    if lens in ("pinhole", "radtan", "rational", "kannala_brandt"):
+        assert read == camera
+    else:
+        assert read.model == "kannala_brandt"
+
+
+def test_camera_info_without_intrinsics_says_where_they_come_from() -> None:
+    with pytest.raises(OutputError, match=r"export from a window, or give --config"):
+        formats()["ros_camera_info"].text(exported_extrinsic(np.zeros(6), camera=None), None)
 
 
 @pytest.mark.parametrize("name", formats())

@@ -24,7 +24,7 @@ from coec.calibration.state import (
     overdue,
 )
 from coec.calibration.state_machine import AppliedChange, HealthState
-from coec.calibration.types import Decision, Reason, Rig
+from coec.calibration.types import Decision, LensEstimate, Reason, Rig
 from coec.config import MonitorConfig, PolicyConfig, TrackerConfig
 from coec.errors import StateError
 from coec.io.serialise import result_of
@@ -106,6 +106,27 @@ def test_what_an_earlier_version_held_is_held_though_nobody_knows_by_whom(tmp_pa
     back = restarted(tmp_path)
     assert back is not None
     assert back.hold == ExtrinsicHold()
+
+
+def test_the_lens_of_a_window_comes_back_and_an_earlier_version_knew_none(tmp_path: Path) -> None:
+    values = np.random.default_rng(5).normal(size=(4, 4))
+    lens = LensEstimate(values[0], values[1], values[2], values[3], np.array([True, False, True, True]), 0.1)
+    store = StateStore(tmp_path, "test")
+    state = after_estimate(initial_state(ESTIMATE_RIG), replace(estimate(1), lens=lens), 0, RULES)
+    saved(store, ESTIMATE_RIG, state, {})
+    back = restarted(tmp_path)
+    assert back is not None
+    assert back.latest is not None
+    assert back.latest.lens is not None
+    np.testing.assert_array_equal(back.latest.lens.free_sigma, lens.free_sigma)
+    for name in ("latest", "accepted"):
+        del store._pairs[ESTIMATE_RIG.pair][name]["lens"], store._pairs[ESTIMATE_RIG.pair][name]["intrinsics"]["sha256"]
+    store.flush()
+    older = StateStore(tmp_path, "test").load(ESTIMATE_RIG)
+    assert older is not None
+    assert not older.lost
+    assert older.state.latest is not None
+    assert older.state.latest.lens is None
 
 
 def test_pairs_do_not_touch_each_other(tmp_path: Path) -> None:

@@ -232,7 +232,15 @@ def health_of(
         evaluated_ns=known.completed_stamp_ns,
         age_s=known.age_s,
         alarms=_alarms_of(known.state.record),
+        intrinsics=_lens_drift(result),
     )
+
+
+def _lens_drift(result: CalibrationResult | None) -> replies.LensDrift | None:
+    """The lens according to the latest window. Nothing applies it: the configuration has the intrinsics."""
+    if result is None or result.lens is None:
+        return None
+    return replies.LensDrift(**dict(result.lens), window_id=result.window_id, data_stamp_ns=result.data_stamp_ns)
 
 
 def _alarms_of(record: AlarmRecord) -> replies.Alarms:
