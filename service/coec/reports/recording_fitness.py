@@ -195,7 +195,7 @@ _GAIN: Mapping[str, float] = MappingProxyType(
 )
 """The power of the number of pairs with which a figure changes at best: if every pair is independent, no error is
 common to all, and what contradicts the rig does so by chance. σ falls faster than by the root, because few pairs hardly
-show how far they scatter. Figures that are not listed stay as they are. See docs/measured.md."""
+show how far they scatter. Figures that are not listed stay as they are."""
 
 
 CLOSE = 1.1
