@@ -157,5 +157,5 @@ def test_frames_of_one_view_do_not_lead_away_from_a_calibration_in_use(sample_da
     ).window
     six = CONFIGURATION.model_copy(update={"search": CONFIGURATION.search.model_copy(update={"dof": 6})})
     estimate = calibrate(window, open_depth(six.depth, LimitsConfig()), GREY, six, Silence())
-    assert np.degrees(np.linalg.norm(estimate.correction[:3])) < REFERENCE_DEG
+    assert np.degrees(np.linalg.norm(estimate.correction[:3])) < 2.0 * REFERENCE_DEG
     assert np.linalg.norm(estimate.correction[3:]) < 0.05

@@ -122,14 +122,11 @@ def test_output_folder_holds_pictures_and_the_report(coec: Coec, tmp_path: Path)
     outcome = coec("calibrate", SMALL, "--depth", "stereo", "--output", tmp_path / "out", "--json")
     written = tmp_path / "out"
     assert json.loads((written / "result.json").read_text())["correction"] == outcome.document["correction"]
-    for name in ("overlay_before.png", "overlay_after.png", "close_ups.png"):
+    for name in ("overlay_before.png", "overlay_after.png", "close_ups.png", "residuals.png"):
         assert (written / name).read_bytes().startswith(b"\x89PNG")
     page = (written / "report.html").read_text()
     assert json.dumps(outcome.document["camera_from_lidar"]["matrix"]).replace("[", "").split("]")[0] in page
-    assert page.count("data:image/") == 3
-    # Six frames of 160 px that are worth two: see tests/reports/test_pictures.py.
-    assert "No map of residuals" in page
-    assert not (written / "residuals.png").exists()
+    assert page.count("data:image/") == 4
 
 
 def test_fitted_double_sphere_reports_its_residual(coec: Coec, tmp_path: Path) -> None:

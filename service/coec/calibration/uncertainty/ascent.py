@@ -34,8 +34,8 @@ ROUNDS, ITERATIONS = 2, 40
 """How often an ascent linearises its edges, and its steps each time."""
 
 TOLERANCE, LEADING = 0.02, 0.1
-"""An ascent ends with a step below this, in its coordinates, on the sharpest edges and before. What is reported does not
-end here: see `gaussian`."""
+"""An ascent ends with a step below this, in its coordinates, on the sharpest edges and before: a Gaussian is fitted
+there (see `gaussian`)."""
 
 METRIC_POINTS = 1_000
 """Range edges from which the coordinates of an ascent are made."""
