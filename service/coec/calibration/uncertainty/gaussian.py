@@ -117,7 +117,7 @@ def fit_gaussian(
     axes = Coordinates.about(level, start, places, prior, share).axes
     covariance = linalg.product(axes, axes.T)
     local = _Local.about(level, mean, places)
-    half_square, top = 0.0, 0.0
+    half_square = 0.0
     for step in range(steps):
         late = step >= WARM_UP
         rate = MEMORY / (step - WARM_UP + MEMORY) if late else WARM_UP_RATE
@@ -131,9 +131,7 @@ def fit_gaussian(
         gradient = scatter.share * sample.gradient - np.einsum("ij,i->j", whitened, off)
         root = _bounded_root(rate * curvature + (1.0 - rate) * np.eye(n))
         towards = linalg.cholesky_solve(root, gradient[:, None])[:, 0] * (rate if late else 1.0)
-        value = scatter.share * sample.top - 0.5 * float(np.einsum("i,i", off, off))
-        blend = rate if late else 1.0
-        half_square, top = half_square + blend * (sample.top - half_square), top + blend * (value - top)
+        half_square += (rate if late else 1.0) * (sample.top - half_square)
         mean = mean.copy()
         mean[free] += np.einsum("ij,j->i", factor, towards / max(1.0, float(np.max(np.abs(towards)))))
         covariance = linalg.product(factor, linalg.cholesky_solve(root, factor.T))
@@ -142,6 +140,7 @@ def fit_gaussian(
     whole = np.zeros((SIZE, SIZE))
     whole[np.ix_(free, free)] = covariance
     volume = 0.5 * float(linalg.log_determinant(linalg.cholesky(covariance)))
+    top = scatter.share * half_square - 0.5 * float(np.sum((mean[free] / of_places) ** 2))
     evidence = top + volume - float(np.sum(np.log(of_places)))
     return GaussianFit(mean, whole, scatter.share, sqrt(max(2.0 * half_square, 0.0)), top, evidence)
 
