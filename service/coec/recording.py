@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 from coec.calibration import pipeline
 from coec.calibration import types as calibration
 from coec.calibration.frames.time_offset import TimeOffset, estimate_time_offset
+from coec.calibration.search.mistake_ranking import probable_mistake
+from coec.calibration.solver import prepare_window_data
 from coec.calibration.uncertainty.systematic import require_fit
 from coec.calibration_options import CalibrationOptions, Progress, checked, configuration_of
 from coec.config import CalibrationConfig, LimitsConfig, VerdictConfig, WindowConfig
-from coec.errors import NotAcceptedError, SourceError, UsageError
+from coec.errors import CalibrationError, NotAcceptedError, SourceError, UsageError
 from coec.geometry.cameras import intrinsics_of, name_of
 from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
 from coec.io import user_files
@@ -34,7 +36,7 @@ from coec.io.recordings.layouts import RecordingSource as Source
 from coec.io.recordings.recording_source import HasGroundTruth
 from coec.io.recordings.window_cutting import LoadedWindow, NoPairsError
 from coec.io.rig_files import intrinsics_config
-from coec.io.serialise import matrix_of, result_of
+from coec.io.serialise import matrix_of, mistake_of, result_of
 from coec.io.user_files import read_bytes
 from coec.reports.formatting import count
 from coec.reports.overlay import titled
@@ -92,6 +94,7 @@ class Solution:
         configuration: the settings that decided the result.
         fit: how well the fitted camera model fits; None where the recording's own model was used.
         offset: offset of the camera's clock; None where it was not requested.
+        mistake: probable mistake in the inputs, if the result was refused; else None.
     """
 
     window: calibration.Window
@@ -100,6 +103,20 @@ class Solution:
     configuration: CalibrationConfig
     fit: CameraFit | None
     offset: TimeOffset | None
+    mistake: calibration.Mistake | None = None
+
+
+class MistakenInputError(CalibrationError):
+    """A window without a result, because its inputs contain a mistake.
+
+    Attributes:
+        mistake: the mistake.
+    """
+
+    def __init__(self, error: CalibrationError, mistake: calibration.Mistake) -> None:
+        super().__init__(f"{error}. {mistake.text}")
+        self.mistake = mistake
+        self.details = {"mistake": mistake_of(mistake).model_dump(mode="json")}
 
 
 def solve(loaded: LoadedWindow, options: CalibrationOptions, progress: calibration.Progress) -> Solution:
@@ -113,7 +130,7 @@ def solve(loaded: LoadedWindow, options: CalibrationOptions, progress: calibrati
     Raises:
         UsageError: a value that does not exist.
         ModelError: the depth network cannot be opened.
-        CalibrationError: there is no result.
+        CalibrationError: there is no result; `MistakenInputError` if the inputs contain a mistake.
     """
     configuration = configuration_of(options, options.get("configuration") or loaded.configuration)
     window, perturb, model = loaded.window, options.get("perturb"), options.get("camera_model")
@@ -123,13 +140,41 @@ def solve(loaded: LoadedWindow, options: CalibrationOptions, progress: calibrati
     depth = open_depth(configuration.depth, LimitsConfig())
     progress.step("prepare", 1, 1)
     images = GreyImages(LimitsConfig())
-    estimate = pipeline.calibrate(window, depth, images, configuration, progress)
+    estimate, mistake = calibrated(window, depth, images, configuration, progress)
     offset = None
     if options.get("time_offset"):
         offset = estimate_time_offset(window, images, estimate.optimum.T_camera_lidar, configuration)
         progress.step("time offset", 1, 1)
     result = result_of(estimate, window.rig, loaded.vehicle)
-    return Solution(window, estimate, result, configuration, fit, offset)
+    return Solution(window, estimate, result, configuration, fit, offset, mistake)
+
+
+def calibrated(
+    window: calibration.Window,
+    depth: calibration.DepthModel,
+    images: calibration.ImageReader,
+    configuration: CalibrationConfig,
+    progress: calibration.Progress,
+) -> tuple[calibration.Estimate, calibration.Mistake | None]:
+    """The estimate of a window; if it is refused, also the mistake in the inputs that probably caused it.
+
+    Raises:
+        MistakenInputError: there is no result because of a mistake.
+        CalibrationError: there is no result.
+    """
+    try:
+        estimate = pipeline.calibrate(window, depth, images, configuration, progress)
+    except CalibrationError as error:
+        mistake = probable_mistake(prepare_window_data(window, depth, images, configuration, progress), None)
+        if mistake is None:
+            raise
+        raise MistakenInputError(error, mistake) from error
+    if estimate.verdict.decision is calibration.Decision.ACCEPTED:
+        return estimate, None
+    data = prepare_window_data(window, depth, images, configuration, progress)
+    mistake = probable_mistake(data, estimate.optimum.T_camera_lidar)
+    progress.step("mistakes", 1, 1)
+    return estimate, mistake
 
 
 def perturbation_of(perturb: str | Sequence[float]) -> NDArray[np.float64]:

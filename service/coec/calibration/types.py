@@ -522,6 +522,28 @@ class Estimate:
         return self.uncertainty.sigma
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Mistake:
+    """A probable mistake in the inputs of a window.
+
+    Attributes:
+        code: machine-readable, see `search.mistakes`.
+        text: what is probably wrong, and what to do.
+        significance: of the edges without the mistake, in standard deviations of wrong poses; NaN if it was not tried.
+        significance_as_given: the same of the inputs as they are.
+        camera, T_camera_lidar: intrinsics and extrinsic (4, 4) without the mistake.
+        correctable: whether these correct it, so that the images stay as they are.
+    """
+
+    code: str
+    text: str
+    significance: float
+    significance_as_given: float
+    camera: Camera
+    T_camera_lidar: Matrix4
+    correctable: bool
+
+
 class DepthModel(Protocol):
     """A virtual depth sensor: one camera frame in, one depth map out (METHOD, section 1)."""
 

@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Unpack
 import typer
 
 from coec.calibration_options import CalibrationOptions
-from coec.cli.options import Json, Source, with_calibration_options
+from coec.cli.options import Fix, Json, Source, show_correction, with_calibration_options
 from coec.errors import LensError, OutputError
 
 if TYPE_CHECKING:
     from coec.geometry.cameras import Camera
+    from coec.io.recordings.window_cutting import LoadedWindow
     from coec.recording import Solution
+    from coec.reports.console import StageTimes
 
 
 @with_calibration_options(CalibrationOptions)
@@ -38,13 +40,14 @@ def calibrate(
         ),
     ] = False,
     as_json: Json = False,
+    fix: Fix = False,
     **options: Unpack[CalibrationOptions],
 ) -> int:
     """Calibrate from a recording: exit 0 if the result is accepted, 1 if the self-diagnosis refuses it."""
     from coec.config import WindowConfig
     from coec.io import user_files as files
-    from coec.io.recordings import window_cutting
-    from coec.recording import perturbation_of, solve
+    from coec.io.recordings import manifest_correction, window_cutting
+    from coec.recording import perturbation_of
     from coec.reports import calibration, console
     from coec.reports.console import StageTimes
 
@@ -52,13 +55,14 @@ def calibrate(
         files.try_folder(output)
     if options.get("perturb") is not None:
         perturbation_of(options["perturb"] or ())
+    manifest = manifest_correction.manifest_of(source) if fix else None
     with console.progress() as bars:
         times = StageTimes(bars)
         loaded = window_cutting.load_window(
             source, options.get("frames"), WindowConfig().pairs, lambda done, total: times.step("load", done, total)
         )
         with picture_of_lens_error(output, loaded.window.rig.camera):
-            solution = solve(loaded, options, times)
+            solution = _solved(loaded, options, times, manifest)
     document = _document(solution, times.elapsed_s())
     written: list[Path] = []
     left_out: tuple[str, ...] = ()
@@ -72,15 +76,11 @@ def calibrate(
     if as_json:
         console.print_json(document)
     else:
-        calibration.show(
-            solution.window,
-            solution.result,
-            configuration=solution.configuration,
-            camera_fit=document.get("camera_fit"),
-            time_offset=document.get("time_offset"),
-            elapsed_s=document["elapsed_s"],
-            intrinsics=intrinsics,
-        )
+        _show(solution, document, intrinsics=intrinsics)
+    if manifest is not None and solution.mistake is not None:
+        show_correction(manifest, solution.mistake, loaded.window.rig)
+    elif solution.mistake is not None and solution.mistake.correctable and manifest_correction.has_manifest(source):
+        console.say("coec: the same command with --fix writes a corrected dataset.yaml")
     if not_written is not None:
         console.say(f"coec: {not_written}")
     elif output is not None and not as_json:
@@ -91,13 +91,43 @@ def calibrate(
     return 0 if solution.result.verdict.decision == "accepted" and not_written is None else 1
 
 
+def _solved(loaded: LoadedWindow, options: CalibrationOptions, progress: StageTimes, manifest: Path | None) -> Solution:
+    """The solution; if there is none because of a mistake in `manifest`, a corrected one is written before the error
+    goes on."""
+    from coec.recording import MistakenInputError, solve
+
+    try:
+        return solve(loaded, options, progress)
+    except MistakenInputError as error:
+        if manifest is not None:
+            show_correction(manifest, error.mistake, loaded.window.rig)
+        raise
+
+
+def _show(solution: Solution, document: dict[str, Any], *, intrinsics: bool) -> None:
+    from coec.reports import calibration
+
+    calibration.show(
+        solution.window,
+        solution.result,
+        configuration=solution.configuration,
+        camera_fit=document.get("camera_fit"),
+        time_offset=document.get("time_offset"),
+        mistake=document["mistake"],
+        elapsed_s=document["elapsed_s"],
+        intrinsics=intrinsics,
+    )
+
+
 def _document(solution: Solution, elapsed_s: dict[str, float]) -> dict[str, Any]:
     import numpy as np
 
+    from coec.io.serialise import mistake_of
     from coec.schemas.replies import CalibrationReport
 
     fit, offset = solution.fit, solution.offset
-    report = CalibrationReport(**dict(solution.result), elapsed_s=elapsed_s)
+    mistake = None if solution.mistake is None else mistake_of(solution.mistake)
+    report = CalibrationReport(**dict(solution.result), elapsed_s=elapsed_s, mistake=mistake)
     document: dict[str, Any] = report.model_dump(mode="json")
     if fit is not None:
         document["camera_fit"] = {
@@ -158,7 +188,7 @@ def _write(
         blocks = (*blocks, Pictures((file_picture(paths[-1]),)))
     report = CalibrationReport.model_validate(document)
     written = files.write_output(folder / "result.json", to_json(report))
-    remarks = calibration.remarks(document.get("camera_fit"), document.get("time_offset"))
+    remarks = calibration.remarks(document.get("camera_fit"), document.get("time_offset"), document["mistake"])
     of_result = calibration_page(
         report, window, calibration.start_of(window), blocks, remarks, Provenance.here(), intrinsics=intrinsics
     )

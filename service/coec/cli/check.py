@@ -7,11 +7,11 @@ from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 from coec.calibration_options import SolverOptions, configuration_of
-from coec.cli.options import Depth, Json, Source
+from coec.cli.options import Depth, Fix, Json, Source, show_correction
 from coec.errors import CalibrationError, SourceError
 
 if TYPE_CHECKING:
-    from coec.calibration.types import Estimate
+    from coec.calibration.types import Estimate, Mistake
     from coec.io.recordings.layouts import RecordingSource
     from coec.reports.console import StageTimes
     from coec.reports.recording_fitness import Cadence, Fitness, Notice
@@ -24,6 +24,9 @@ REFUSES, MAY_REFUSE = "calibrate will refuse this, because ", "calibrate may ref
 TOO_FEW = "too_few_frames"
 """Code of the remark that a trial of the same few frames outweighs if it is accepted."""
 
+NOT_IN_VIEW = "little_in_view"
+"""Code of the remark whose cause the trial may find: a mistake in the inputs."""
+
 LEVEL_STYLES = {"fail": "bold red", "warn": "bold yellow", "ok": ""}
 
 
@@ -31,15 +34,18 @@ def check(
     source: Source,
     depth: Depth = None,
     as_json: Json = False,
+    fix: Fix = False,
 ) -> int:
     """Show the content of a recording and predict the verdict: exit 1 if a calibration is impossible or refused."""
     from coec.calibration.monitor.check_verdict import MIN_PAIRS
     from coec.io.recordings.layouts import open_source
+    from coec.io.recordings.manifest_correction import manifest_of
     from coec.reports import console
     from coec.reports.console import StageTimes
     from coec.reports.formatting import count
     from coec.reports.recording_fitness import fitness_of
 
+    manifest = manifest_of(source) if fix else None
     try:
         recording = open_source(source)
     except SourceError:
@@ -50,36 +56,50 @@ def check(
         times = StageTimes(bars)
         seen = fitness_of(recording)
         times.step("examine", 1, 1)
-        failed = any(note.level == "fail" and note.code != TOO_FEW for note in seen.remarks)
-        trial = None if failed else _trial(recording, depth, times)
+        # A wrong pose may leave nothing in view. Which mistake it is, the trial finds.
+        failed = any(note.level == "fail" and note.code not in (TOO_FEW, NOT_IN_VIEW) for note in seen.remarks)
+        trial, mistake = (None, None) if failed else _trial(recording, depth, times)
     if _is_accepted(trial):
         enough = f"{count(seen.camera.frames, 'camera frame')} suffice here; a check by the service needs {MIN_PAIRS}."
         remarks = (replace(n, level="warn", text=enough) if n.code == TOO_FEW else n for n in seen.remarks)
         seen = replace(seen, remarks=tuple(remarks))
-    notes = (*seen.remarks, *_of_trial(trial, seen))
+    notes = _ordered((*_of_mistake(mistake), *seen.remarks, *_of_trial(trial, seen)))
     if as_json:
-        console.print_json(_document(source, replace(seen, remarks=_ordered(notes)), trial))
+        console.print_json(_document(source, replace(seen, remarks=notes), trial, mistake))
     else:
-        _show(recording.name, replace(seen, remarks=_ordered(notes)), trial)
+        _show(recording.name, replace(seen, remarks=notes), trial)
+    if manifest is not None and mistake is not None:
+        show_correction(manifest, mistake, recording.rig)
     return int(any(note.level == "fail" for note in notes))
 
 
-def _trial(recording: RecordingSource, depth: str | None, times: StageTimes) -> Estimate | CalibrationError:
-    """A calibration of a few pairs near the recording's own extrinsic: shows how well this scene fixes the pose."""
-    from coec.calibration.pipeline import calibrate
+def _trial(
+    recording: RecordingSource, depth: str | None, times: StageTimes
+) -> tuple[Estimate | CalibrationError, Mistake | None]:
+    """A calibration of a few pairs near the recording's own extrinsic: shows how well this scene fixes the pose; if it
+    is refused, with the probable mistake in the inputs."""
     from coec.config import LimitsConfig
     from coec.io.depth.depth_maps import open_depth
     from coec.io.images import GreyImages
     from coec.io.recordings import window_cutting
+    from coec.recording import MistakenInputError, calibrated
 
     loaded = window_cutting.window_of_recording(recording, PAIRS, lambda done, total: times.step("load", done, total))
     window = loaded.window
     configuration = configuration_of(SolverOptions(depth=depth), loaded.configuration)
     limits = LimitsConfig()
     try:
-        return calibrate(window, open_depth(configuration.depth, limits), GreyImages(limits), configuration, times)
+        return calibrated(window, open_depth(configuration.depth, limits), GreyImages(limits), configuration, times)
+    except MistakenInputError as error:
+        return error, error.mistake
     except CalibrationError as error:
-        return error
+        return error, None
+
+
+def _of_mistake(mistake: Mistake | None) -> tuple[Notice, ...]:
+    from coec.reports.recording_fitness import Notice
+
+    return () if mistake is None else (Notice("fail", mistake.code, mistake.text),)
 
 
 def _of_trial(trial: Estimate | CalibrationError | None, seen: Fitness) -> tuple[Notice, ...]:
@@ -119,11 +139,19 @@ def _is_accepted(trial: Estimate | CalibrationError | None) -> bool:
     return isinstance(trial, Estimate) and trial.verdict.decision is Decision.ACCEPTED
 
 
-def _document(source: str, seen: Fitness, trial: Estimate | CalibrationError | None) -> dict[str, Any]:
+def _document(
+    source: str, seen: Fitness, trial: Estimate | CalibrationError | None, mistake: Mistake | None
+) -> dict[str, Any]:
     from coec.calibration.types import Estimate
-    from coec.io.serialise import degrees_or_null
+    from coec.io.serialise import degrees_or_null, mistake_of
 
-    document = {"source": source, **asdict(seen), "prediction": _prediction(seen, trial), "trial": None}
+    document = {
+        "source": source,
+        **asdict(seen),
+        "prediction": _prediction(seen, trial),
+        "trial": None,
+        "mistake": None if mistake is None else mistake_of(mistake).model_dump(mode="json"),
+    }
     if isinstance(trial, Estimate):
         document["trial"] = {
             "pairs": trial.pairs,

@@ -25,6 +25,7 @@ from coec.calibration_options import Entry, entries
 from coec.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
+    from coec.calibration.types import Mistake, Rig
     from coec.config import Config, PairConfig
     from coec.io.zenoh.command_auth import Credentials
     from coec.io.zenoh.query_client import RouterAddress
@@ -60,6 +61,13 @@ SOURCE_HELP = (
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on standard output, nothing else.")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite existing files.")]
+Fix = Annotated[
+    bool,
+    typer.Option(
+        "--fix",
+        help="If a mistake in a dataset.yaml is found, write dataset.fixed.yaml without it, next to it, and exit 1.",
+    ),
+]
 Source = Annotated[str, typer.Argument(metavar="SOURCE", help=SOURCE_HELP, show_default=False)]
 ConfigFile = Annotated[
     Path,
@@ -164,6 +172,19 @@ SessionFile = Annotated[
     ),
 ]
 RouterTimeout = Annotated[float, typer.Option("--timeout", help="Seconds to wait for the router.", min=0.01)]
+
+
+def show_correction(manifest: Path, mistake: Mistake, rig: Rig) -> None:
+    """Writes a manifest without a mistake, and reports on standard error what changed.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    from coec.io.recordings.manifest_correction import write_corrected
+    from coec.reports import console
+
+    correction = write_corrected(manifest, mistake, rig.camera, rig.T_camera_lidar_nominal)
+    console.say(f"coec: written {correction.path}: {'; '.join(correction.changes)}")
 
 
 @dataclass(frozen=True, slots=True)

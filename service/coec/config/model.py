@@ -62,11 +62,10 @@ class ConfigModel(BaseModel):
 
 
 INVERSE_POSE = (
-    "the pose is `T_camera_lidar`, which maps LiDAR to camera coordinates: write the inverse of this matrix there"
+    "the pose maps LiDAR to camera coordinates: write this matrix, which is its inverse, under `T_lidar_camera`"
 )
 SAME_POSE = "the pose is called `T_camera_lidar`: its four rows, mapping LiDAR to camera coordinates"
 FOREIGN_KEY_ADVICE = {
-    "T_lidar_camera": INVERSE_POSE,
     "lidar_from_camera": INVERSE_POSE,
     "T_cam_lidar": SAME_POSE,
     "camera_from_lidar": SAME_POSE,

@@ -9,6 +9,7 @@ from pydantic import Field, field_validator, model_validator
 
 from coec.config import stages
 from coec.config.model import IDENTITY, ConfigModel, FilePath, KeyExpression, Matrix4x4, Name
+from coec.config.pose_forms import WrittenPose, with_direction
 from coec.geometry import CAMERA_MODELS
 
 if TYPE_CHECKING:
@@ -282,7 +283,9 @@ class OpenPairConfig(ConfigModel):
     camera: OpenCameraConfig
     lidar: OpenLidarConfig
     ego: OpenEgoConfig | None = None
-    T_camera_lidar: Matrix4x4 | None = Field(default=None, description="workshop calibration: LiDAR to camera")
+    T_camera_lidar: WrittenPose | None = Field(
+        default=None, description="workshop calibration: LiDAR to camera; or its inverse as `T_lidar_camera`"
+    )
     pairing: stages.PairingConfig = stages.PairingConfig()
     window: stages.WindowConfig = stages.WindowConfig()
     calibration: stages.CalibrationConfig = stages.CalibrationConfig()
@@ -295,6 +298,11 @@ class OpenPairConfig(ConfigModel):
         """Those that it has, by the names under which they are counted."""
         streams = {"camera": self.camera, "lidar": self.lidar, "ego": self.ego}
         return {name: stream for name, stream in streams.items() if stream is not None}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_direction(cls, document: Any) -> Any:
+        return with_direction(document) if isinstance(document, dict) and "T_lidar_camera" in document else document
 
     @model_validator(mode="before")
     @classmethod
@@ -313,7 +321,9 @@ class PairConfig(OpenPairConfig):
     camera: CameraConfig
     lidar: LidarConfig
     ego: EgoConfig | None = None
-    T_camera_lidar: Matrix4x4 = Field(description="workshop calibration: LiDAR to camera")
+    T_camera_lidar: WrittenPose = Field(
+        description="workshop calibration: LiDAR to camera; or its inverse as `T_lidar_camera`"
+    )
 
     @property
     def streams(self) -> Mapping[str, KnownStreamConfig]:

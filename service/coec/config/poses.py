@@ -30,9 +30,40 @@ def rows_of(xyz_m: tuple[float, float, float], quaternion_xyzw: tuple[float, flo
     return _rows(se3.transform_from(se3.rotation_from_quaternion_xyzw(np.array(quaternion_xyzw)), np.array(xyz_m)))
 
 
-def is_rigid(rows: Matrix4x4) -> bool:
-    """Whether the matrix is a rotation and a translation."""
-    return se3.is_rigid(np.array(rows))
+def rows_of_angles(xyz_m: tuple[float, float, float], rpy: tuple[float, float, float], *, degrees: bool) -> Matrix4x4:
+    """The pose with a position, metres, and roll, pitch, yaw about the fixed axes x, y, z, in degrees or radians."""
+    roll, pitch, yaw = (se3.rotation_exp(turn) for turn in np.diag(np.radians(rpy) if degrees else np.array(rpy)))
+    return _rows(se3.transform_from(yaw @ pitch @ roll, np.array(xyz_m)))
+
+
+def rigidity_problem(rows: Matrix4x4) -> str:
+    """Why the matrix is not a rotation and a translation; empty if it is."""
+    T = np.array(rows)
+    if se3.is_rigid(T):
+        return ""
+    expected, rotation = "rows of a rotation, a translation, then 0 0 0 1", T[:3, :3]
+    if not np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]):
+        transposed = " (is it transposed?)" if np.array_equal(T[:, 3], [0.0, 0.0, 0.0, 1.0]) else ""
+        return f"{expected}; its last row is {' '.join(f'{value:g}' for value in T[3])}{transposed}"
+    with np.errstate(over="ignore", invalid="ignore"):
+        off, mirrored = np.abs(rotation.T @ rotation - np.eye(3)).max(), np.linalg.det(rotation) < 0.0
+    if off < LOOSE and mirrored:
+        return f"{expected}; its determinant is -1, so it mirrors: an axis has the wrong sign, or two are exchanged"
+    return f"{expected}; its rows are orthonormal only to {off:.1g}: give more digits, or a quaternion"
+
+
+LOOSE = 1e-2
+"""Entries of RᵀR - 1 up to which a matrix is a rotation with few digits, perhaps mirrored."""
+
+
+def inverse(T_a_b: Matrix4x4) -> Matrix4x4:
+    """T_b_a of a rigid T_a_b."""
+    return _rows(se3.inverse(np.array(T_a_b)))
+
+
+def product(T_a_b: Matrix4x4, T_b_c: Matrix4x4) -> Matrix4x4:
+    """T_a_c."""
+    return _rows(np.array(T_a_b) @ np.array(T_b_c))
 
 
 def relative(T_vehicle_a: Matrix4x4, T_vehicle_b: Matrix4x4) -> Matrix4x4:

@@ -11,10 +11,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Self, TypeVar
 
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
-from coec.config.model import IDENTITY, MAX_NAME, ConfigModel, Matrix4x4, Name, describe
+from coec.config.model import IDENTITY, MAX_NAME, ConfigModel, Name, describe
 from coec.config.pair import OpenCameraConfig, OpenEgoConfig, OpenLidarConfig
+from coec.config.pose_forms import Pose
 from coec.config.stages import (
     CalibrationConfig,
     MonitorConfig,
@@ -24,46 +25,6 @@ from coec.config.stages import (
     WindowConfig,
 )
 from coec.errors import ConfigError
-
-
-class _QuaternionPose(ConfigModel):
-    """A pose written in one line."""
-
-    xyz: tuple[float, float, float]
-    quaternion: tuple[float, float, float, float]
-
-
-QUATERNION_TOLERANCE = 0.01
-"""How far the length of a quaternion may be from 1: within this it is rounding, beyond it a mistyped number."""
-
-
-def _pose_rows(value: Any) -> Any:
-    """The rows of a pose that is written as a position and a quaternion; any other value as it is."""
-    if not isinstance(value, dict):
-        return value
-    from coec.config import poses
-
-    try:
-        written = _QuaternionPose.model_validate(value)
-    except ValidationError as error:
-        expected = "rows of 4x4 numbers, or {xyz: [x, y, z], quaternion: [x, y, z, w]}"
-        raise ValueError(f"give {expected}: {describe(error)}") from None
-    length = sum(number * number for number in written.quaternion) ** 0.5
-    if abs(length - 1.0) > QUATERNION_TOLERANCE:
-        raise ValueError(f"quaternion: its length is {length:.3g}, not 1; its numbers are x, y, z, w")
-    return poses.rows_of(written.xyz, written.quaternion)
-
-
-def _validated_rigid(rows: Matrix4x4) -> Matrix4x4:
-    from coec.config import poses
-
-    if not poses.is_rigid(rows):
-        raise ValueError("not a rigid transform: rows of a rotation, a translation, then 0 0 0 1")
-    return rows
-
-
-Pose = Annotated[Matrix4x4, BeforeValidator(_pose_rows), AfterValidator(_validated_rigid)]
-"""A 4x4 matrix, or `{xyz: [x, y, z], quaternion: [x, y, z, w]}` in one line."""
 
 
 class LinkConfig(ConfigModel):

@@ -154,7 +154,8 @@ def _is_incomplete(pair: Any) -> bool:
     if not isinstance(pair, dict):
         return False
     lidar, ego = pair.get("lidar", pair.get("points")), pair.get("ego")
-    locations = [(pair, "T_camera_lidar"), (pair.get("camera"), "intrinsics"), (pair.get("camera"), "frame_id")]
+    pose = "T_lidar_camera" if "T_lidar_camera" in pair else "T_camera_lidar"
+    locations = [(pair, pose), (pair.get("camera"), "intrinsics"), (pair.get("camera"), "frame_id")]
     locations += [(lidar, "frame_id"), *([] if ego is None else [(ego, "T_lidar_ego")])]
     return any(isinstance(part, str) or (isinstance(part, dict) and part.get(name) is None) for part, name in locations)
 

@@ -25,6 +25,7 @@ from coec.config import (
     SweepConfig,
     describe,
 )
+from coec.config.poses import rigidity_problem
 from coec.errors import ConfigError, DecodeError, WindowError, cannot_read, require_readable
 from coec.geometry import cameras, se3
 from coec.io import converter
@@ -98,7 +99,7 @@ def rigid_matrix(rows: Matrix4x4, where: str) -> Matrix4:
     """
     T = np.array(rows, dtype=np.float64)
     if not se3.is_rigid(T):
-        raise ConfigError(f"{where} is not a rigid transform: rows of a rotation, a translation, then 0 0 0 1")
+        raise ConfigError(f"{where} is not a rigid transform: {rigidity_problem(rows)}")
     return T
 
 

@@ -19,6 +19,7 @@ from coec.calibration.types import (
     LensEstimate,
     Matrix4,
     Metric,
+    Mistake,
     MovedWithin,
     Optimum,
     Reason,
@@ -149,6 +150,16 @@ def result_of(estimate: Estimate, rig: Rig, vehicle: str) -> replies.Calibration
         moved=None if estimate.moved is None else _moved_of(estimate.moved),
         intrinsics=intrinsics_of(rig.camera),
         lens=None if estimate.lens is None else lens_of(estimate.lens, rig.camera),
+    )
+
+
+def mistake_of(mistake: Mistake) -> replies.ProbableMistake:
+    """The wire form of a mistake in the inputs."""
+    return replies.ProbableMistake(
+        code=mistake.code,
+        text=mistake.text,
+        significance=number_or_null(mistake.significance),
+        significance_as_given=number_or_null(mistake.significance_as_given),
     )
 
 

@@ -38,6 +38,7 @@ def show(
     configuration: CalibrationConfig,
     camera_fit: Mapping[str, Any] | None,
     time_offset: Mapping[str, Any] | None,
+    mistake: Mapping[str, Any] | None,
     elapsed_s: Mapping[str, float],
     intrinsics: bool = False,
 ) -> None:
@@ -47,6 +48,7 @@ def show(
         window, result: what was calibrated, and the result.
         configuration: with which it was calibrated.
         camera_fit, time_offset: as `--json` has them; None: not asked for.
+        mistake: in the inputs, as `--json` has it; None: none was found.
         elapsed_s: seconds by stage.
         intrinsics: whether the lens is shown, too.
     """
@@ -54,6 +56,8 @@ def show(
     _show_axes(window, result)
     console.show_verdict(result)
     if not _accepted(result):
+        if mistake is not None:
+            console.show(mistake["text"], "bold yellow")
         console.show("what follows was not accepted: it is the best guess, and not to be used on a vehicle", "yellow")
     show_pose(
         result.camera_from_lidar, result.lidar_frame, result.camera_frame, warning="" if _accepted(result) else REFUSED
@@ -76,9 +80,13 @@ def show(
     console.show(f"{result.evaluations} evaluations, {result.stop_reason}; {stages}")
 
 
-def remarks(camera_fit: Mapping[str, Any] | None, time_offset: Mapping[str, Any] | None) -> list[str]:
-    """What else was found out, one sentence each; both arguments as `--json` has them, None: not asked for."""
-    sentences = []
+def remarks(
+    camera_fit: Mapping[str, Any] | None,
+    time_offset: Mapping[str, Any] | None,
+    mistake: Mapping[str, Any] | None = None,
+) -> list[str]:
+    """What else was found out, one sentence each; all arguments as `--json` has them, None: not asked for, or none."""
+    sentences = [] if mistake is None else [str(mistake["text"])]
     if camera_fit is not None:
         sentences.append(
             f"{camera_fit['model']} fitted to {camera_fit['of']}: {camera_fit['residual_rms_px']:.4f} px rms, "

@@ -220,10 +220,24 @@ class CalibrationResult(Message):
     )
 
 
+class ProbableMistake(Part):
+    """A mistake in the inputs that explains why a result was refused."""
+
+    code: Text = Field(description="machine-readable, for example `inverse_pose`")
+    text: Text = Field(description="what is probably wrong, and what to do")
+    significance: float | None = Field(
+        description="of the edges without the mistake, standard deviations; null: the sizes of images do not match"
+    )
+    significance_as_given: float | None = Field(description="the same for the inputs as they are")
+
+
 class CalibrationReport(CalibrationResult):
     """What `coec calibrate --json` prints: the result and how long it took."""
 
     elapsed_s: dict[Text, float] = Field(description="by stage, s")
+    mistake: ProbableMistake | None = Field(
+        default=None, description="probable mistake in the inputs of a refused result"
+    )
 
 
 # --- replies ------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from ruamel.yaml import YAML
 from coec.calibration.types import CameraFrame, EgoMotion, ImageFormat, LidarFrame
 from coec.config import LimitsConfig
 from coec.errors import SourceError
-from coec.geometry import cameras
+from coec.geometry import cameras, se3
 from coec.io.images import decode_bgr, decode_depth
 from coec.io.recordings.layouts import open_source
 from support.scenes import ROOF_POSE, sweep_in_frame, turning_sweep
@@ -155,7 +155,7 @@ def numbered(*stamps_ns: float) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("changes", "way_out"),
     [
-        ({"T_lidar_camera": IDENTITY}, "T_lidar_camera: there is no such key; .*write the inverse of this matrix"),
+        ({"T_lidar_camera": IDENTITY}, "T_camera_lidar and T_lidar_camera are given: give one of them"),
         ({"camera_from_lidar": IDENTITY}, "the pose is called `T_camera_lidar`"),
         (numbered(1600000000.5, 1600000000.6), r"frames\.0\.stamp_ns: .*multiply seconds by 1000000000"),
         (numbered(1600000000, 1600000002), "looks like seconds: multiply every stamp by 1000000000"),
@@ -173,6 +173,40 @@ def test_what_people_write_by_mistake_is_refused_with_the_way_out(
     a_dataset(tmp_path, **changes)
     with pytest.raises(SourceError, match=way_out):
         open_source(str(tmp_path))
+
+
+def test_the_extrinsic_in_other_forms_and_directions(tmp_path: Path) -> None:
+    a_dataset(tmp_path)
+    T = open_source(str(tmp_path)).rig.T_camera_lidar_nominal
+    text = (tmp_path / "dataset.yaml").read_text()
+    begin, end = text.index("T_camera_lidar:"), text.index("mask:")
+    for written in (
+        f"T_lidar_camera: {se3.inverse(T).tolist()}",
+        "T_camera_lidar: {xyz: [0.1, 0.2, 0.3], rpy_deg: [90, -90, 0]}",
+        "T_camera_lidar: {xyz: [0.1, 0.2, 0.3], quaternion_xyzw: [0.5, -0.5, 0.5, 0.5]}",
+        "T_camera_cloud: {xyz: [0.1, 0.2, 0.3], rpy_rad: [1.5707963267948966, -1.5707963267948966, 0]}",
+    ):
+        (tmp_path / "dataset.yaml").write_text(f"{text[:begin]}{written}\n{text[end:]}")
+        assert open_source(str(tmp_path)).rig.T_camera_lidar_nominal == pytest.approx(T, abs=1e-9)
+
+
+def test_a_pose_from_the_frame_of_the_cloud(tmp_path: Path) -> None:
+    T_cloud_lidar = {"xyz": [1.0, 2.0, 3.0], "rpy_deg": [0, 0, 90]}
+    a_dataset(tmp_path, T_cloud_lidar=T_cloud_lidar)
+    text = (tmp_path / "dataset.yaml").read_text().replace("T_camera_lidar", "T_camera_cloud")
+    (tmp_path / "dataset.yaml").write_text(text)
+    rig = open_source(str(tmp_path)).rig
+    p_cloud = np.array([[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0]]) @ [5.0, 6.0, 7.0, 1.0]
+    expected = [-p_cloud[1] + 0.1, -p_cloud[2] + 0.2, p_cloud[0] + 0.3]
+    assert (rig.T_camera_lidar_nominal @ [5.0, 6.0, 7.0, 1.0])[:3] == pytest.approx(expected)
+    assert rig.cloud is not None
+
+
+def test_a_cloud_in_millimetres_is_refused(tmp_path: Path) -> None:
+    a_dataset(tmp_path)
+    np.save(tmp_path / "1.npy", 4000.0 * np.ones((5, 3), np.float32))
+    with pytest.raises(SourceError, match=r"half of the points are farther than .*divide millimetres by 1000"):
+        list(open_source(str(tmp_path)).messages())
 
 
 def test_stamps_that_can_be_nanoseconds_are_taken_as_they_are(tmp_path: Path) -> None:

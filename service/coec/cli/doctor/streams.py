@@ -22,6 +22,7 @@ from coec.errors import DecodeError
 from coec.io.depth.depth_maps import STEREO
 from coec.io.images import Inspector
 from coec.io.logs import LossCounter
+from coec.io.recordings.window_cutting import offset_cause
 from coec.io.zenoh.bus import Bus, InputSample, StreamInput
 from coec.io.zenoh.ros_node import RosSide, RosTopicList, listed
 from coec.schemas.documents import Finding
@@ -389,7 +390,8 @@ def _in_step(pair: PairConfig, camera: Sequence[tuple[int, int]], lidar: Sequenc
     typical_s = median(away_ns) / NS_PER_S
     text = f"camera and LiDAR: {100 * share:.0f} % of the frames have a sweep within {tolerance_s:g} s"
     if share == 0.0:
-        text += f"; they are {abs(typical_s):.3f} s apart"
+        cause = offset_cause(typical_s, camera[0][0] / NS_PER_S, lidar[0][0] / NS_PER_S)
+        text += f"; they are {abs(typical_s):.3f} s apart{cause}"
         return fail("in_step", where, text, "put both sensors on one clock (PTP), or correct the driver's stamps")
     if share < PARTNERS:
         advice = "trigger the camera by the LiDAR, or raise pairing.tolerance_s; frames without a partner are dropped"

@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, model_validator
 
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
 from coec.config import CameraIntrinsics, FilePath, LimitsConfig, Matrix4x4, PointTimeConfig, describe, load_yaml
+from coec.config.pose_forms import with_direction
 from coec.errors import ConfigError, DecodeError, SourceError, UsageError
 from coec.io.recordings.bag_storage import BagMessage, BagReader, BagStorage
 from coec.io.rig_files import camera_of, load_mask, rigid_matrix
@@ -251,6 +252,11 @@ class IntrinsicsFile(BaseModel):
     camera: CameraIntrinsics
     T_camera_lidar: Matrix4x4 | None = None
     mask: FilePath | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_direction(cls, document: Any) -> Any:
+        return with_direction(document)
 
 
 def rig_of_bag(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from coec.calibration.frames.lidar_origin import apparent_origin, from_origin
 from coec.calibration.types import LidarFrame, Matrix4
 from coec.errors import SourceError
+from coec.geometry.points import lengths
 from coec.io.user_files import read_bytes, read_npy, read_npz
 
 Columns = dict[str, NDArray[np.generic]]
@@ -335,16 +336,27 @@ def load_cloud(stamp_ns: int, frame_id: str, path: Path) -> LidarFrame:
         return _frame(stamp_ns, frame_id, path, columns)
 
 
+FARTHEST_MEDIAN_M = 400.0
+"""Median range of a sweep above which its unit is wrong: LiDARs of vehicles reach 200 to 400 m. In millimetres, a room
+of a metre has a thousand."""
+
+
 def measured_from(
     cloud: LidarFrame, T_cloud_lidar: Matrix4, frame_id: str, where: Path, advice: Mapping[str, str]
 ) -> LidarFrame:
     """A sweep in the LiDAR's own frame, see `from_origin`.
 
     Raises:
-        SourceError: the points were not measured from the origin of that frame. The message ends with the entry of
-            `advice` for the cause.
+        SourceError: the points are in millimetres, or were not measured from the origin of that frame. The message of
+            the latter ends with the entry of `advice` for the cause.
     """
     sweep = from_origin(cloud, T_cloud_lidar, frame_id)
+    median_m = float(np.median(lengths(sweep.xyz_m))) if len(sweep.xyz_m) else 0.0
+    if median_m > FARTHEST_MEDIAN_M:
+        raise SourceError(
+            f"{where}: half of the points are farther than {median_m:.0f} m: coordinates are in metres, "
+            "so divide millimetres by 1000"
+        )
     contradiction = apparent_origin(sweep)
     if contradiction is not None:
         raise SourceError(f"{where}: {contradiction.sentence} {advice[contradiction.cause]}")

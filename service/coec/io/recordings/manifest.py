@@ -10,28 +10,40 @@ from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from coec.calibration.frames.lidar_origin import ApparentOrigin, SeveralOrigins
-from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Matrix4, Rig
-from coec.config import IDENTITY, CameraIntrinsics, FilePath, LimitsConfig, Matrix4x4, Name, describe, load_yaml
+from coec.calibration.types import (
+    CameraFrame,
+    CloudFrame,
+    EgoMotion,
+    EncodedImage,
+    ImageFormat,
+    LidarFrame,
+    Matrix4,
+    Rig,
+)
+from coec.config import IDENTITY, CameraIntrinsics, FilePath, LimitsConfig, Name, describe, load_yaml
+from coec.config.pose_forms import Pose, with_direction
 from coec.errors import ConfigError, DecodeError, SourceError
 from coec.io.images import encode_depth_png, probe, raw_image
 from coec.io.recordings.bag_index import with_ros_camera_info
 from coec.io.recordings.cloud_files import load_cloud, measured_from
 from coec.io.recordings.kitti import load_image
 from coec.io.recordings.recording_source import FramewiseRecording, RecordedFrame, SourceSpec
-from coec.io.rig_files import camera_of, load_mask, rigid_matrix
+from coec.io.rig_files import camera_of, load_mask
 from coec.io.ros.camera_info import info_of_yaml
 from coec.io.user_files import read_bytes, read_npy
 
 FILE_NAME = "dataset.yaml"
 CAMERA_FRAME = "camera"
 LIDAR_FRAME = "lidar"
+CLOUD_FRAME = "cloud"
 
 _MAX_STAMP_NS = 2**31 * 1_000_000_000
 """Bound for stamps: ROS 2 time, in which frames are recorded, has signed 32-bit seconds."""
@@ -68,11 +80,16 @@ class ManifestDocument(_Strict):
     pair: Name
     camera: CameraIntrinsics
     mask: FilePath | None = None
-    T_camera_lidar: Matrix4x4
-    T_cloud_lidar: Matrix4x4 = Field(
+    T_camera_lidar: Pose
+    T_cloud_lidar: Pose = Field(
         default=IDENTITY, description="pose of the LiDAR in the frame in which the points are given"
     )
     frames: tuple[FrameDocument, ...] = Field(min_length=1)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_direction(cls, document: Any) -> Any:
+        return with_direction(document)
 
 
 def open_manifest(spec: SourceSpec) -> FramewiseRecording:
@@ -99,8 +116,8 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
     try:
         document = ManifestDocument.model_validate(with_ros_camera_info(text, path, rectified=False))
         camera = camera_of(document.camera)
-        T_camera_lidar = rigid_matrix(document.T_camera_lidar, "T_camera_lidar")
-        T_cloud_lidar = rigid_matrix(document.T_cloud_lidar, "T_cloud_lidar")
+        T_camera_lidar = np.array(document.T_camera_lidar, dtype=np.float64)
+        T_cloud_lidar = np.array(document.T_cloud_lidar, dtype=np.float64)
         mask = None if document.mask is None else load_mask(path.parent / document.mask, camera)
     except ValidationError as error:
         raise SourceError(f"{path}: {describe(error)}") from error
@@ -114,6 +131,7 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
         T_camera_lidar_nominal=T_camera_lidar,
         T_lidar_ego=np.eye(4),
         mask=mask,
+        cloud=None if np.array_equal(T_cloud_lidar, np.eye(4)) else CloudFrame(CLOUD_FRAME, T_cloud_lidar),
     )
     frames = sorted(document.frames, key=lambda frame: frame.stamp_ns)
     _check_frames(path, frames)

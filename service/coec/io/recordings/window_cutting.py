@@ -121,10 +121,37 @@ def clocks_text(camera_stamps_ns: Sequence[int], sweep_stamps_ns: Sequence[int])
     if not overlap:
         offset_s = float(sweeps[0] - cameras[0])
     return (
-        f"the clouds are {abs(offset_s):.3f} s {'ahead of' if offset_s > 0 else 'behind'} the images. The stamps must "
+        f"the clouds are {abs(offset_s):.3f} s {'ahead of' if offset_s > 0 else 'behind'} the images"
+        f"{offset_cause(offset_s, cameras[0], sweeps[0])}. The stamps must "
         "be of one clock: let both drivers take the computer's time, or synchronise the sensors (PTP), and record "
         "again; where the difference is known, correct the stamps of one stream"
     )
+
+
+TIME_SCALES_S = {37.0: "TAI - UTC (PTP without its UTC offset)", 18.0: "GPS time - UTC", 19.0: "TAI - GPS time"}
+"""Differences of time scales, s, since 2017."""
+
+START_S = 1.0
+"""Streams of one recording begin within this time."""
+
+EPOCH_S = 1e8
+"""Stamps below count from the start of a computer, not from 1970."""
+
+
+def offset_cause(offset_s: float, camera_s: float, sweep_s: float) -> str:
+    """What the difference `offset_s` of two streams looks like that begin at `camera_s` and `sweep_s`, in brackets;
+    empty if it looks like nothing known."""
+    smaller, larger = sorted((camera_s, sweep_s))
+    for power, unit in ((3, "microseconds"), (6, "milliseconds"), (9, "seconds")):
+        if larger > EPOCH_S and smaller > 0.0 and 0.9 < larger / smaller / 10**power < 1.1:
+            return f" (the stamps of one stream are probably {unit}, not nanoseconds)"
+    if smaller < EPOCH_S < larger:
+        return " (one stream counts from the start of a computer, the other from 1970)"
+    hours = round(offset_s / 3600.0)
+    if hours and abs(offset_s - 3600.0 * hours) < START_S:
+        return f" (whole hours, {hours:+d}: one driver probably stamps in local time)"
+    scale = next((name for gap_s, name in TIME_SCALES_S.items() if abs(abs(offset_s) - gap_s) < 0.5), None)
+    return "" if scale is None else f" (this is {scale})"
 
 
 def evenly_spread(count: int, limit: int) -> list[int]:

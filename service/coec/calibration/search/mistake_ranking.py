@@ -1,0 +1,405 @@
+"""Tests whether a classical mistake in the inputs explains why a window fits nothing.
+
+Every supposition (`mistakes`) gives a pose near which the edges should fit, because what people give is only
+approximate. A cover of turns about it is scored on coarse edges, and from the best poses local ascents follow finer
+ones, in all six degrees of freedom. What is compared is the significance z of the edges at their ends. Poses about an
+end, with
+about the same in view, show how z scatters where nothing fits: by σ₀, more than 1 because range edges are not
+independent. The log-likelihood is z² / (2·σ₀²), as in `uncertainty.posterior` with κ = 1 / σ₀².
+
+A mistake is named if its posterior odds against everything else are `LEAST_ODDS`: against the inputs as given, wherever
+the search ended, and against the suppositions that put the camera elsewhere. So a window that fits nowhere accuses
+nothing.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import ceil, log, log1p, log2, nan, radians
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.objective.edges import COARSEST_BLUR_RAD
+from coec.calibration.search.mistakes import (
+    AS_GIVEN,
+    AS_GIVEN_ODDS,
+    CLOCK_OFFSET,
+    COMPENSATED,
+    IMAGE_SCALE,
+    KINDS,
+    TURNED_90,
+    Supposition,
+    suppositions,
+)
+from coec.calibration.solver import WindowData
+from coec.calibration.types import Matrix4, Mistake, Rig
+from coec.errors import CalibrationError
+from coec.geometry import se3
+from coec.geometry.cameras import pixel_rad, scaled
+from coec.geometry.edges.alignment import AscentStart, EdgeFrames, alignments, ascend, frame_alignment, significances
+from coec.geometry.edges.charts import moved_by, unit_ball
+from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, EdgeScales
+from coec.geometry.edges.range_edges import RangeEdges, range_edges
+from coec.geometry.points import thinned
+
+FRAMES = 8
+"""Most pairs that are used, evenly selected."""
+
+LEAST_PAIRS = 3
+"""Fewest pairs that can accuse: one scene fits by chance, upside down for example."""
+
+LEVELS = 4
+"""Levels of edges: each twice as sharp as the one before. The coarsest is blurred by 0.6 to 1.2 degrees."""
+
+FINEST, FINE, MEDIUM, COARSE = range(LEVELS)
+"""Places of the levels."""
+
+SCREENING_POINTS, REFINING_POINTS, ASCENT_POINTS, SETTLING_POINTS = 600, 2_000, 4_000, 20_000
+"""Most range edges of the window from level to level. What fits a few of them by chance does not fit them all."""
+
+REACH_RAD, COVER = radians(6.0), 1_000
+"""Reach of the cover of turns about each supposition, and its number of poses: a degree apart, about the blur of the
+coarse edges."""
+
+STARTS, ABOUT_RAD, COVER_ABOUT = 9, radians(0.8), 40
+"""Best poses of a cover, about each of which turns are scored on finer edges, their reach and their number."""
+
+ASCENTS, ASCENDING, SETTLED = 3, 24, 8
+"""Local ascents of a supposition; suppositions that have any; and those that reach the finest edges."""
+
+NULL_POSES, NULL_RAD, NULL_INSIDE = 150, radians(15.0), 0.3
+"""Poses about an end that show how z scatters where nothing fits, how far they reach, and the share of it that is left
+out: the hill of an end is narrower."""
+
+IN_VIEW, LEAST_NULL = 0.4, 20
+"""These poses need this share of what the end has in view; at least so many of them count."""
+
+LEAST_IN_VIEW = 0.05
+"""An end counts only if it sees this share of the range edges of the end that sees most. A few edges at the rim of a
+view fit anywhere."""
+
+KNOWN_TO_RAD = radians(2.0)
+"""Scale of the turn from what is given to what is true, as of a measured or constructed mount."""
+
+KNOWN_TO_M = 0.2
+"""Scale of the shift, likewise."""
+
+LEAST_ODDS = 1000.0
+"""Posterior odds from which on a mistake is named. See docs/measured.md."""
+
+LEAST_SPEED_MPS = 2.0
+"""Slower vehicles hardly move within a sweep."""
+
+LEAST_TIMED = 6
+"""Fewest pairs whose times are doubted: the time of a sweep changes little."""
+
+LATER = (-1.0, -0.5, -0.15, 0.15, 0.5, 1.0)
+"""By how many sweeps clouds may be later than their stamps say: a frame; from the middle of a sweep to its end; or the
+delay of an exposure."""
+
+SAME_ASPECT = 0.02
+"""Relative difference of the aspect ratios of an image and of the same image in another size, at most."""
+
+GROSS = 0.7
+"""A mistake is named only if the inputs as given are less significant than this share of it. What is a little off is
+the subject of the posterior. See docs/measured.md."""
+
+SAME_RAD = radians(5.0)
+"""Poses nearer than this are one explanation."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ranked:
+    """A supposition, and where its edges fit best.
+
+    Attributes:
+        T_camera_lidar: (4, 4) that pose.
+        significance: of the edges there, in units of its scatter.
+        in_view: Σ w² of the range edges in view there.
+        null: mean and standard deviation of the significance where nothing fits.
+        log_posterior: up to a constant.
+    """
+
+    supposition: Supposition
+    T_camera_lidar: Matrix4
+    significance: float
+    in_view: float
+    null: tuple[float, float]
+    log_posterior: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Edges:
+    """Range edges of some pairs, and the edges of their images at the last levels of a pyramid, from fine to coarse.
+
+    Attributes:
+        xyz_m: (3, E) float32.
+        weight: (E,) float32.
+        first_point: (F + 1,) int64.
+        maps: by level, halvings of the resolution and (F, h, w) int8.
+        detected: the range edges of each pair.
+    """
+
+    xyz_m: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    first_point: NDArray[np.int64]
+    maps: tuple[tuple[int, NDArray[np.int8]], ...]
+    detected: tuple[RangeEdges, ...]
+
+    def seen_by(self, supposition: Supposition, number: int, points: int) -> EdgeFrames:
+        """About `points` of them on one level."""
+        level, maps = self.maps[number]
+        camera = scaled(supposition.camera, 0.5**level, 0.5**level)._replace(width=maps.shape[2], height=maps.shape[1])
+        maps = np.ascontiguousarray(maps[:, :, ::-1]) if supposition.mirrored else maps
+        frames = EdgeFrames(camera, self.xyz_m, self.weight, self.first_point, maps)
+        return frames.of_points(thinned(len(self.weight), points))
+
+
+def probable_mistake(data: WindowData, solved: Matrix4 | None) -> Mistake | None:
+    """The mistake in the inputs of a window that was refused; None if none is probable. `solved` (4, 4) is where the
+    search ended; None: nowhere."""
+    try:
+        wrong_size = _wrong_size(data)
+        edges = _edges(data) if wrong_size is None else None
+    except CalibrationError:
+        return None
+    if edges is None:
+        return wrong_size
+    given, *ranked = _rank_suppositions(edges, data.window.rig, solved)
+    late_s, timed = _other_time(data, edges, given)
+    best, *others = ranked or [given]
+    if timed is not None and timed.log_posterior > best.log_posterior:
+        mistake = _named(timed, given)
+        return replace(mistake, text=f"{mistake.text} (the clouds {late_s:+.3f} s)") if late_s else mistake
+    if best is given:
+        return None
+    rivals = [given.log_posterior, *(one.log_posterior for one in others if not _same_place(one, best))]
+    certain = best.log_posterior - float(np.logaddexp.reduce(rivals)) >= log(LEAST_ODDS)
+    return _named(best, given) if certain and given.significance <= GROSS * best.significance else None
+
+
+def _named(best: Ranked, given: Ranked) -> Mistake:
+    kind, supposition = KINDS[best.supposition.code], best.supposition
+    fit = f"with {kind.tried} the edges fit at {best.significance:.1f} sigma"
+    return Mistake(
+        supposition.code,
+        f"{fit} (as given: {max(given.significance, 0.0):.1f}): {kind.advice}",
+        best.significance,
+        given.significance,
+        supposition.camera,
+        supposition.T_camera_lidar,
+        correctable=not supposition.mirrored and supposition.code not in (COMPENSATED, CLOCK_OFFSET),
+    )
+
+
+def _other_time(data: WindowData, edges: Edges, given: Ranked) -> tuple[float, Ranked | None]:
+    """The clouds as they are, if a driver has compensated them for motion, or some seconds later: which fits best, and
+    by how many seconds it is later. None if none is more probable than the inputs as given by `LEAST_ODDS`, for
+    vehicles that hardly move, and where no times are known."""
+    part = _some_pairs(data)
+    sweep_s = _sweep_duration_s(part)
+    moving = any(pair.motion is not None and pair.motion.reaches(LEAST_SPEED_MPS) for pair in part.window.pairs)
+    if not (data.compensated and moving and sweep_s > 0.0 and len(part.window.pairs) >= LEAST_TIMED):
+        return 0.0, None
+    trials = [(AS_GIVEN, 0.0, part), (COMPENSATED, 0.0, replace(part, compensated=False))]
+    trials += [(CLOCK_OFFSET, share * sweep_s, _later(part, share * sweep_s)) for share in LATER]
+    ends = []
+    for code, late_s, other in trials:
+        moved = replace(edges, xyz_m=_placed(other, edges.detected))
+        supposition = replace(given.supposition, code=code)
+        starts = [given.T_camera_lidar, supposition.T_camera_lidar]
+        # The same scatter for all: only the difference counts.
+        end = _settled(moved, _local_ascent(moved, supposition, starts), given.null)
+        odds = 0.0 if code == AS_GIVEN else log(KINDS[code].odds / AS_GIVEN_ODDS)
+        ends.append((late_s, replace(end, log_posterior=end.log_posterior + odds)))
+    as_given, *others = ends
+    best = max(others, key=lambda end: end[1].log_posterior)
+    return best if best[1].log_posterior - as_given[1].log_posterior >= log(LEAST_ODDS) else (0.0, None)
+
+
+def _sweep_duration_s(data: WindowData) -> float:
+    """The time from the first point of a sweep to its last; 0 if it is unknown."""
+    times_s, sweep = data.window.pairs[0].lidar.time_offset_s, data.window.rig.sweep
+    if times_s is not None and len(times_s):
+        return float(times_s.max() - times_s.min())
+    return 0.0 if sweep is None else sweep.period_s
+
+
+def _later(data: WindowData, late_s: float) -> WindowData:
+    """The window with all sweeps later."""
+    pairs = (
+        replace(pair, lidar=replace(pair.lidar, stamp_ns=pair.lidar.stamp_ns + round(1e9 * late_s)))
+        for pair in data.window.pairs
+    )
+    return replace(data, window=replace(data.window, pairs=tuple(pairs)))
+
+
+def _wrong_size(data: WindowData) -> Mistake | None:
+    """Images that are not of the size of the intrinsics."""
+    camera, pose = data.window.rig.camera, data.window.rig.T_camera_lidar_nominal
+    height, width = next(iter(data.greys())).shape
+    if (width, height) == (camera.width, camera.height):
+        return None
+    sizes = f"the images have {width} x {height} px, the intrinsics are for {camera.width} x {camera.height} px"
+    if (width, height) == (camera.height, camera.width):
+        return Mistake(TURNED_90, f"{sizes}: {KINDS[TURNED_90].advice}", nan, nan, camera, pose, correctable=False)
+    across, down = width / camera.width, height / camera.height
+    if abs(across / down - 1.0) > SAME_ASPECT:
+        return None
+    fitting = scaled(camera, across, down)._replace(width=width, height=height)
+    return Mistake(IMAGE_SCALE, f"{sizes}: {KINDS[IMAGE_SCALE].advice}", nan, nan, fitting, pose, correctable=True)
+
+
+def _rank_suppositions(edges: Edges, rig: Rig, solved: Matrix4 | None) -> list[Ranked]:
+    """The inputs as given, first, then as they would be without a mistake, the most probable first."""
+    screened = [_screened(edges, supposition) for supposition in suppositions(rig)]
+    given, *others = screened
+    starts = given.starts if solved is None else (*given.starts, solved)
+    of_given = _settled(edges, _local_ascent(edges, given.supposition, starts))
+    others = sorted(others, key=lambda one: -one.significance)[:ASCENDING]
+    ascended = [_local_ascent(edges, one.supposition, one.starts) for one in others]
+    best = sorted(ascended, key=lambda one: -one.significance)[:SETTLED]
+    variants = Counter(one.supposition.code for one in screened)
+    ends = [_settled(edges, one) for one in best]
+    least = LEAST_IN_VIEW * max(one.in_view for one in (of_given, *ends))
+    return [of_given, *_with_priors([one for one in ends if one.in_view >= least], variants)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Screened:
+    """A supposition, its largest significance on coarser edges, and the starts (4, 4) of its local ascents."""
+
+    supposition: Supposition
+    significance: float
+    starts: tuple[Matrix4, ...]
+
+
+def _screened(edges: Edges, supposition: Supposition) -> _Screened:
+    """The best of a cover of turns. The supposed pose is a start, too, wherever it ranks."""
+    poses = _turned(supposition.T_camera_lidar[None], _turns(REACH_RAD, COVER))
+    z = significances(edges.seen_by(supposition, COARSE, SCREENING_POINTS), poses)
+    starts = np.concatenate([poses[:1], poses[np.argsort(-z, kind="stable")[: STARTS - 1]]])
+    poses = _turned(starts, _turns(ABOUT_RAD, COVER_ABOUT))
+    z = significances(edges.seen_by(supposition, MEDIUM, REFINING_POINTS), poses).reshape(STARTS, COVER_ABOUT)
+    starts = poses.reshape(STARTS, COVER_ABOUT, 4, 4)[np.arange(STARTS), z.argmax(axis=1)]
+    best = np.argsort(-z.max(axis=1)[1:], kind="stable")[: ASCENTS - 1] + 1
+    return _Screened(supposition, float(z.max()), (starts[0], *starts[best]))
+
+
+def _turned(poses: NDArray[np.float64], turns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(K·T, 4, 4) each of the poses (K, 4, 4), turned by rotation vectors (T, 3)."""
+    still = np.zeros_like(turns)
+    return np.concatenate([moved_by(np.ascontiguousarray(pose), turns, still) for pose in poses])
+
+
+def _turns(reach_rad: float, count: int) -> NDArray[np.float64]:
+    """(count, 3) rotation vectors that cover a ball; the first is zero."""
+    return np.concatenate([np.zeros((1, 3)), reach_rad * unit_ball(count - 1)])
+
+
+def _shell() -> NDArray[np.float64]:
+    """(n, 3) turns to poses about an end where nothing fits, but about as much is in view."""
+    ball = unit_ball(NULL_POSES)
+    return np.asarray(NULL_RAD * ball[np.linalg.norm(ball, axis=1) > NULL_INSIDE])
+
+
+def _local_ascent(edges: Edges, supposition: Supposition, starts: Sequence[Matrix4]) -> Ranked:
+    """The best end of local ascents on ever finer edges."""
+    ends = list(starts)
+    for number, step_rad in ((MEDIUM, radians(0.3)), (FINE, radians(0.15))):
+        frames = edges.seen_by(supposition, number, ASCENT_POINTS)
+        ends = _ascended(frames, ends, step_rad)
+    z = [frame_alignment(frames, end).significance for end in ends]
+    best = int(np.argmax(z))
+    return Ranked(supposition, ends[best], z[best], 0.0, (0.0, 1.0), 0.0)
+
+
+def _settled(edges: Edges, ascended: Ranked, null: tuple[float, float] | None = None) -> Ranked:
+    """The end of the local ascent on the finest edges. `null` are mean and deviation of z where nothing fits; None:
+    about the end."""
+    frames = edges.seen_by(ascended.supposition, FINEST, SETTLING_POINTS)
+    (end,) = _ascended(frames, [ascended.T_camera_lidar], radians(0.08))
+    around, at = alignments(frames, _turned(end[None], _shell())), frame_alignment(frames, end)
+    # What looks past the points does not scatter.
+    square, in_view = around.square.sum(axis=1), float(at.square.sum())
+    looking = np.argsort(-square, kind="stable")[: max(LEAST_NULL, int((square > IN_VIEW * in_view).sum()))]
+    if null is None:
+        z = np.array([around.at(int(pose)).significance for pose in looking])
+        null = float(z.mean()), max(1.0, float(z.std()))
+    significance = (at.significance - null[0]) / null[1]
+    log_likelihood = 0.5 * max(significance, 0.0) ** 2
+    return Ranked(ascended.supposition, end, significance, in_view, null, log_likelihood + log(AS_GIVEN_ODDS))
+
+
+def _ascended(frames: EdgeFrames, poses: Sequence[Matrix4], step_rad: float) -> list[Matrix4]:
+    ascents = [AscentStart(pose, 0, len(frames.maps)) for pose in poses]
+    return [summit.pose for summit in ascend(frames, ascents, _moves(step_rad))]
+
+
+def _with_priors(ranked: Sequence[Ranked], variants: Mapping[str, int]) -> list[Ranked]:
+    """Suppositions that put the camera to one place fit equally well. Which is the likeliest depends on how far each is
+    from there, and on the odds of its kind, of which there are so many `variants`."""
+    probable = []
+    for one in ranked:
+        alike = [
+            other for other in ranked if _same_place(other, one) and other.supposition.camera == one.supposition.camera
+        ]
+        best = max(alike, key=lambda other: other.significance)
+        difference = se3.difference(best.T_camera_lidar, one.supposition.T_camera_lidar)
+        away = (difference[:3] @ difference[:3]) / KNOWN_TO_RAD**2 + (difference[3:] @ difference[3:]) / KNOWN_TO_M**2
+        odds = KINDS[one.supposition.code].odds / variants[one.supposition.code]
+        log_posterior = 0.5 * max(best.significance, 0.0) ** 2 + log(odds) - 2.0 * log1p(away)
+        probable.append(replace(one, significance=best.significance, log_posterior=log_posterior))
+    return sorted(probable, key=lambda one: -one.log_posterior)
+
+
+def _same_place(one: Ranked, other: Ranked) -> bool:
+    """Whether two suppositions put the camera to the same place, perhaps with another lens."""
+    same_images = one.supposition.mirrored == other.supposition.mirrored
+    return same_images and se3.rotation_angle_rad(one.T_camera_lidar @ se3.inverse(other.T_camera_lidar)) < SAME_RAD
+
+
+def _moves(step_rad: float) -> NDArray[np.float64]:
+    """(2, 12, 4, 4) a step either way along each axis of the camera, and half of it."""
+    steps = se3.axis_steps(step_rad)
+    return np.array(
+        [
+            [se3.perturbation(sign * share * steps * unit) for unit in np.eye(6) for sign in (1.0, -1.0)]
+            for share in (1.0, 0.5)
+        ]
+    )
+
+
+def _some_pairs(data: WindowData) -> WindowData:
+    """The window with at most `FRAMES` pairs."""
+    pairs = data.window.pairs
+    selected = sorted({round(place) for place in np.linspace(0, len(pairs) - 1, FRAMES)})
+    return replace(data, window=replace(data.window, pairs=tuple(pairs[index] for index in selected)))
+
+
+def _placed(data: WindowData, detected: Sequence[RangeEdges]) -> NDArray[np.float32]:
+    """(3, E) range edges of all pairs, motion-compensated."""
+    placed = [data.points(frame, edges.index) + edges.shift_m for frame, edges in enumerate(detected)]
+    return np.ascontiguousarray(np.concatenate(placed).T)
+
+
+def _edges(data: WindowData) -> Edges | None:
+    """Those of some pairs; None if there are too few."""
+    if len(data.window.pairs) < LEAST_PAIRS:
+        return None
+    part = _some_pairs(data)
+    detected = tuple(range_edges(pair.lidar.xyz_m, pair.lidar.ring) for pair in part.window.pairs)
+    first = np.concatenate([[0], np.cumsum([len(edges.index) for edges in detected])]).astype(np.int64)
+    if first[-1] == 0:
+        return None
+    camera, mask = part.window.rig.camera, part.window.rig.mask
+    lit = mask if mask is not None else np.ones((camera.height, camera.width), np.bool_)
+    coarsest = max(LEVELS - 1, ceil(log2(COARSEST_BLUR_RAD / (BLUR_SIGMA_PX * pixel_rad(camera)))))
+    levels = range(coarsest + 1 - LEVELS, coarsest + 1)
+    # No axis of the LiDAR is distinguished: which it is depends on the supposition.
+    scales = EdgeScales(lit, levels[0], coarsest, upright=np.zeros(2))
+    bands = [scales.pyramid(grey).bands for grey in part.greys()]
+    maps = tuple((level, np.stack([of_frame[k] for of_frame in bands])) for k, level in enumerate(levels))
+    weight = np.concatenate([edges.weight for edges in detected])
+    return Edges(_placed(part, detected), weight, first, maps, detected)

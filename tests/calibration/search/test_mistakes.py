@@ -1,0 +1,201 @@
+"""Classical mistakes in the inputs: each is named, right inputs are not accused, and the correction is the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calibration.conftest import window_of
+from coec.calibration.frames.motion_compensation import compensate
+from coec.calibration.search import mistakes
+from coec.calibration.search.mistake_ranking import probable_mistake
+from coec.calibration.search.mistakes import changed
+from coec.calibration.solver import WindowData
+from coec.calibration.types import CameraFrame, CloudFrame, Mistake, Rig, Window
+from coec.config import DepthConfig, LimitsConfig
+from coec.geometry import se3
+from coec.io.depth.depth_maps import open_depth
+from coec.io.images import GreyImages
+from coec.io.recordings.layouts import open_source
+from coec.recording import CallbackProgress
+from support.simulated_drives import rendered_source
+
+Image = NDArray[np.uint8]
+Edit = Callable[[Image], Image]
+
+STREET = "sim:seed=5&seconds=48&camera_hz=0.17&lidar_hz=0.17&camera=pinhole640x320&lidar=32&depth=yes"
+"""Eight frames, six seconds apart: a 90° lens, wider than high."""
+
+DEPTH = open_depth(DepthConfig(model="stereo"), LimitsConfig())
+
+BODY = se3.transform_from(mistakes.OPTICAL_FROM_BODY.T, np.zeros(3))
+"""T_body_optical."""
+
+
+class EditedImages(GreyImages):
+    """Images that a driver, or a person, has turned or mirrored."""
+
+    def __init__(self, edit: Edit | None = None) -> None:
+        super().__init__(LimitsConfig())
+        self._edit = edit
+
+    def grey(self, frame: CameraFrame) -> Image:
+        grey = super().grey(frame)
+        return grey if self._edit is None else np.ascontiguousarray(self._edit(grey))
+
+
+def named(window: Window, edit: Edit | None = None) -> Mistake | None:
+    return probable_mistake(WindowData(window, True, DEPTH, EditedImages(edit), CallbackProgress(None)), None)
+
+
+def given(window: Window, rig: Rig) -> Window:
+    return replace(window, rig=rig)
+
+
+@pytest.fixture(scope="module")
+def street() -> Window:
+    return window_of(rendered_source(STREET))
+
+
+def approximate(rig: Rig) -> Rig:
+    """What a person knows of the pose: a degree and some centimetres off."""
+    off = se3.perturb(rig.T_camera_lidar_nominal, np.array([0.012, -0.008, 0.01, 0.02, -0.03, 0.02]))
+    return replace(rig, T_camera_lidar_nominal=off)
+
+
+def wrong_pose(code: str, rig: Rig) -> Rig:
+    T = rig.T_camera_lidar_nominal
+    quaternion = se3.quaternion_xyzw_from_rotation(T[:3, :3])
+    read = se3.rotation_from_quaternion_xyzw(np.roll(quaternion, 1))
+    poses = {
+        mistakes.INVERSE_POSE: se3.inverse(T),
+        mistakes.QUATERNION_ORDER: se3.transform_from(read, T[:3, 3]),
+        mistakes.CAMERA_AXES: BODY @ T,
+        mistakes.INVERSE_AND_AXES: se3.inverse(BODY @ T),
+        mistakes.LIDAR_AXES: T @ se3.perturbation(np.array([0.0, 0.0, np.pi / 2, 0.0, 0.0, 0.0])),
+    }
+    return replace(rig, T_camera_lidar_nominal=poses[code])
+
+
+def wrong_lens(code: str, rig: Rig) -> Rig:
+    camera = rig.camera
+    lenses = {
+        mistakes.FOCAL_LENGTH: {"fx": 1.5 * camera.fx, "fy": 1.5 * camera.fy},
+        mistakes.IMAGE_SCALE: {
+            "fx": 2.0 * camera.fx,
+            "fy": 2.0 * camera.fy,
+            "cx": 2.0 * camera.cx + 0.5,
+            "cy": 2.0 * camera.cy + 0.5,
+        },
+        mistakes.CENTRE_SWAPPED: {"cx": camera.cy, "cy": camera.cx},
+    }
+    return replace(rig, camera=changed(camera, **lenses[code]))
+
+
+def test_right_inputs_are_not_accused(street: Window) -> None:
+    assert named(street) is None
+    assert named(given(street, approximate(street.rig))) is None
+
+
+def test_a_window_that_fits_nothing_accuses_nothing(street: Window) -> None:
+    rng = np.random.default_rng(1)
+    assert named(street, lambda grey: rng.integers(0, 255, grey.shape, dtype=np.uint8)) is None
+    assert named(street, np.zeros_like) is None
+    assert named(replace(street, pairs=street.pairs[:2])) is None
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        mistakes.INVERSE_POSE,
+        mistakes.QUATERNION_ORDER,
+        mistakes.CAMERA_AXES,
+        mistakes.INVERSE_AND_AXES,
+        mistakes.LIDAR_AXES,
+    ],
+)
+def test_a_wrong_pose_is_named_and_corrected(street: Window, code: str) -> None:
+    right = approximate(street.rig)
+    mistake = named(given(street, wrong_pose(code, right)))
+    assert mistake is not None
+    assert mistake.code == code
+    assert mistake.correctable
+    assert mistake.T_camera_lidar == pytest.approx(right.T_camera_lidar_nominal, abs=1e-9)
+    assert mistake.significance > mistake.significance_as_given / 0.7
+    assert mistakes.KINDS[code].advice in mistake.text
+
+
+@pytest.mark.parametrize("code", [mistakes.FOCAL_LENGTH, mistakes.IMAGE_SCALE, mistakes.CENTRE_SWAPPED])
+def test_a_wrong_lens_is_named_and_corrected(street: Window, code: str) -> None:
+    mistake = named(given(street, wrong_lens(code, approximate(street.rig))))
+    assert mistake is not None
+    assert mistake.code == code
+    right = street.rig.camera
+    assert mistake.camera.fx == pytest.approx(right.fx, rel=0.06)
+    assert (mistake.camera.cx, mistake.camera.cy) == pytest.approx((right.cx, right.cy), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("code", "edit"),
+    [(mistakes.TURNED_180, lambda grey: grey[::-1, ::-1]), (mistakes.MIRRORED, lambda grey: grey[:, ::-1])],
+)
+def test_images_that_are_turned_or_mirrored_are_named(street: Window, code: str, edit: Edit) -> None:
+    mistake = named(given(street, approximate(street.rig)), edit)
+    assert mistake is not None
+    assert (mistake.code, mistake.correctable) == (code, code == mistakes.TURNED_180)
+
+
+def test_a_pose_from_the_frame_of_the_cloud_is_named(street: Window) -> None:
+    T_cloud_lidar = se3.perturbation(np.array([0.0, 0.0, 0.6, 1.0, 0.0, 1.8]))
+    right = street.rig.T_camera_lidar_nominal
+    meant = replace(
+        street.rig,
+        cloud=CloudFrame("base_link", T_cloud_lidar),
+        T_camera_lidar_nominal=right @ se3.inverse(T_cloud_lidar),
+    )
+    mistake = named(given(street, meant))
+    assert mistake is not None
+    assert mistake.code == mistakes.CLOUD_FRAME
+    assert mistake.T_camera_lidar == pytest.approx(right, abs=1e-9)
+
+
+def test_clouds_that_are_compensated_already_are_named(street: Window) -> None:
+    still = tuple(
+        replace(pair, lidar=replace(pair.lidar, xyz_m=compensate(pair, street.rig, enabled=True)))
+        for pair in street.pairs
+    )
+    mistake = named(replace(street, pairs=still))
+    assert mistake is not None
+    assert (mistake.code, mistake.correctable) == (mistakes.COMPENSATED, False)
+
+
+def test_clouds_that_are_stamped_a_sweep_late_are_named(street: Window) -> None:
+    late = tuple(
+        replace(pair, lidar=replace(pair.lidar, stamp_ns=pair.lidar.stamp_ns + 100_000_000)) for pair in street.pairs
+    )
+    mistake = named(replace(street, pairs=late))
+    assert mistake is not None
+    assert mistake.code == mistakes.CLOCK_OFFSET
+    assert mistake.text.endswith("(the clouds -0.100 s)")
+
+
+def test_images_of_another_size_are_named_without_a_search(street: Window) -> None:
+    mistake = named(street, lambda grey: grey[::2, ::2])
+    assert mistake is not None
+    assert mistake.code == mistakes.IMAGE_SCALE
+    assert "the images have 320 x 160 px, the intrinsics are for 640 x 320 px" in mistake.text
+    assert mistake.camera.width == 320
+    assert mistake.camera.fx == pytest.approx(street.rig.camera.fx / 2)
+
+
+def test_a_real_street(sample_data: Path) -> None:
+    window = window_of(open_source(f"kitti360:{sample_data}/kitti360?camera=image_00"))
+    assert named(window) is None
+    mistake = named(given(window, wrong_pose(mistakes.INVERSE_POSE, approximate(window.rig))))
+    assert mistake is not None
+    assert mistake.code == mistakes.INVERSE_POSE
