@@ -112,7 +112,7 @@ def inverse_root(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
         ValueError: a row of it is zero.
     """
     scale = np.sqrt(np.abs(matrix.diagonal()))
-    if not (np.isfinite(scale).all() and (scale > 0.0).all()):
+    if not (np.isfinite(matrix).all() and (scale > 0.0).all()):
         raise ValueError("the edges in view do not depend on a parameter")
     correlation, more = matrix / scale / scale[:, None], 0.0
     while True:

@@ -305,7 +305,13 @@ def _scatter(slopes: NDArray[np.float64]) -> float:
 
 
 def _bounded_root(precision: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, n) Cholesky factor of a precision; where that is small or negative it is increased."""
+    """(n, n) Cholesky factor of a precision; where that is small or negative it is increased.
+
+    Raises:
+        ValueError: the precision is not finite.
+    """
+    if not np.isfinite(precision).all():
+        raise ValueError("the edges in view do not determine the parameters")
     more, unit = 0.0, np.eye(len(precision))
     while True:
         try:
