@@ -69,10 +69,10 @@ FIGURES: Mapping[str, DiagnosticFigure] = MappingProxyType(
         "edges_once": DiagnosticFigure(
             "Edges, counted once",
             "σ",
-            "How significantly the LiDAR's edges lie on those of the images while the vehicle drives. What all frames "
-            "have in common is counted once; as of ten such frames.",
-            "the matched edges are the same in all frames although the vehicle drives, as lines along its road are",
-            "Take a window past other objects: houses, cars, posts and trees within range of the LiDAR.",
+            "How significantly the LiDAR's edges lie on those of the images. What all frames have in common is counted "
+            "once; as of ten such frames.",
+            "the matched edges are few, or the same in all frames, as lines along a road or a standing scene are",
+            "Take a window in motion, past other objects: houses, cars, posts and trees within range of the LiDAR.",
         ),
         "newton_step_deg": DiagnosticFigure(
             "Slope left, rotation",

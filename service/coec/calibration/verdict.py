@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.figures import FIGURES
-from coec.calibration.frames.window import drives
 from coec.calibration.objective.edges import IndependentSamples
 from coec.calibration.objective.landscape import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
@@ -110,16 +109,14 @@ def change_metric(change: ChangePoint | None, limits: VerdictConfig) -> tuple[Me
     return (Metric(MOVED, gain, limits.max_change_gain, at_least=False),)
 
 
-def repetition_metric(
-    independent_samples: IndependentSamples | None, pairs: Sequence[FramePair], limits: VerdictConfig
-) -> tuple[Metric, ...]:
+def repetition_metric(independent_samples: IndependentSamples | None, limits: VerdictConfig) -> tuple[Metric, ...]:
     """How significant the edges of ten such frames are if all that frames have in common counts once; empty if no edges
-    were used, or if the vehicle is not known to drive.
+    were used.
 
     For a standing vehicle, what stands still in its images is the whole scene. For a driving one, what stands still are
     the lines along its road, and any two of those fit each other. See docs/measured.md.
     """
-    if independent_samples is None or not drives(pairs):
+    if independent_samples is None:
         return ()
     return (Metric("edges_once", independent_samples.significance, limits.min_edges_once, at_least=True),)
 
@@ -161,7 +158,7 @@ def optimum_metrics(
             counted_once(of_objective, optimum.uncertainty.independent_samples, len(pairs)), evaluation
         ),
         *shape_metrics(evaluation, optimum.curvature, optimum.sigma, limits),
-        *repetition_metric(optimum.independent, pairs, limits),
+        *repetition_metric(optimum.independent, limits),
         *intrinsics_metric(optimum.posterior, limits),
         *change_metric(change, limits),
     )
