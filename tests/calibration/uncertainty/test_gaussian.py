@@ -84,8 +84,8 @@ def test_it_does_not_depend_on_where_it_begins(rng: np.random.Generator) -> None
 def test_frames_that_disagree_make_the_mean_uncertain(rng: np.random.Generator) -> None:
     points = corner_points(rng)
     pixels = corner_pixels(points)
-    apart = [at + np.array([1.2 * (-1) ** frame, 0.0]) for frame, at in enumerate(pixels)]
-    alike, different = (level_of(corner_edge_levels(seen, points)) for seen in (pixels, apart))
+    disagreeing = [at + np.array([1.2 * (-1) ** frame, 0.0]) for frame, at in enumerate(pixels)]
+    alike, different = (level_of(corner_edge_levels(seen, points)) for seen in (pixels, disagreeing))
 
     def spread(level: AssumedEdges) -> float:
         return float(np.sqrt(deletion_covariance(level, fitted(level, 0.02), PLACES, PRIOR)[1, 1]))
