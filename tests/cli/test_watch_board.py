@@ -114,9 +114,13 @@ def test_keys_select_a_pair_and_report_its_reasons_history_and_overlay(router: R
         vehicle.declare_queryable(keys.history("front"), answer(history))
         vehicle.declare_queryable(keys.overlay("front"), answer(picture))
         reason = {"code": "moved", "text": "The mount has moved.\x1b[2J"}
-        say(vehicle, "truck-1")
-        say(vehicle, "truck-2", state="miscalibrated", reasons=[reason])
-        wait_until(lambda: "2 vehicles, 2 pairs: 1 miscalibrated, 1 healthy" in text(board), "both are told")
+
+        def received() -> bool:
+            say(vehicle, "truck-1")  # until the route is laid
+            say(vehicle, "truck-2", state="miscalibrated", reasons=[reason])
+            return "2 vehicles, 2 pairs: 1 miscalibrated, 1 healthy" in text(board)
+
+        wait_until(received, "both are told")
         shown = text(board)
         assert "moved: The mount has moved." in shown, "the most urgent is chosen"
         assert "\x1b" not in shown, "what a terminal would obey is not passed on"
@@ -138,8 +142,12 @@ def test_keys_select_a_pair_and_report_its_reasons_history_and_overlay(router: R
 @pytest.mark.fault("a pair that does not answer what is asked of it", "the board goes on, and says so")
 def test_what_is_not_answered_is_reported(router: Router) -> None:
     with connected([router.endpoint], 5.0) as vehicle, board_of(router) as board:
-        say(vehicle, "truck-9")
-        wait_until(lambda: "1 vehicle, 1 pair" in text(board), "it is told")
+
+        def received() -> bool:
+            say(vehicle, "truck-9")  # until the route is laid
+            return "1 vehicle, 1 pair" in text(board)
+
+        wait_until(received, "it is told")
         assert board.press("o")
         wait_until(lambda: "no overlay of truck-9/front: nobody answered" in text(board), "nobody answers")
 
