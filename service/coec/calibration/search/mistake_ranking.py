@@ -3,8 +3,7 @@
 Every supposition (`mistakes`) gives a pose near which the edges should fit, because what people give is only
 approximate. A cover of turns about it is scored on coarse edges, and from the best poses local ascents follow finer
 ones, in all six degrees of freedom. What is compared is the significance z of the edges at their ends. Poses about an
-end, with
-about the same in view, show how z scatters where nothing fits: by σ₀, more than 1 because range edges are not
+end, with about the same in view, show how z scatters where nothing fits: by σ₀, more than 1 because range edges are not
 independent. The log-likelihood is z² / (2·σ₀²), as in `uncertainty.posterior` with κ = 1 / σ₀².
 
 A mistake is named if its posterior odds against everything else are `LEAST_ODDS`: against the inputs as given, wherever

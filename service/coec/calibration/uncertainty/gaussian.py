@@ -195,8 +195,8 @@ def _mean_without(
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sample:
     """z²/2 across a Gaussian, in coordinates in which its covariance is one: its mean gradient (n,), its mean negative
-    Hessian (n, n), and its value at the top without ripples. `point` (n,) is one of the places where it
-    was taken, `of_point` z there."""
+    Hessian (n, n), and its value at the top without ripples. `point` (n,) is one of the places where it was taken,
+    `of_point` z there."""
 
     gradient: Vector
     curvature: NDArray[np.float64]
