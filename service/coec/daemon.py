@@ -42,10 +42,10 @@ from coec.service.camera_lidar_pair import Pair
 from coec.service.configuration import redacted_configuration, reload_of, settings_hash
 from coec.service.cpu_budget import Budget
 from coec.service.discovery import completed
-from coec.service.engine.calibration_manager import CalibrationManager
 from coec.service.engine.lidar_pairs import LidarPairs
-from coec.service.engine.rig_estimator_thread import RigEstimatorThread
-from coec.service.ingest.intake import Intake
+from coec.service.engine.pair import CalibrationManager
+from coec.service.engine.rig import RigEstimatorThread
+from coec.service.engine.vehicle import Intake
 from coec.service.pending_pairs import PendingPairs
 from coec.service.process_lifetime import FolderLock, Signals, attempt, handled_signals, joined, locked, stopped
 from coec.service.recording.recorder import Recorder

@@ -20,9 +20,9 @@ from coec.calibration.state import ExtrinsicHold, PairState
 from coec.calibration.state_machine import HealthState
 from coec.calibration.types import Decision, Estimate
 from coec.service.engine.check_progress import CheckProgress
+from coec.service.engine.frame_selector import SelectionStatistics
+from coec.service.engine.pair_stream import StreamStatistics
 from coec.service.ingest.decoder import CAMERA, LIDAR, StreamCounts
-from coec.service.ingest.frame_selector import SelectionStatistics
-from coec.service.ingest.pair_stream import StreamStatistics
 
 S = 1_000_000_000
 PERIOD_S = RULES.monitor.period_s

@@ -20,7 +20,7 @@ from coec.calibration.types import (
 from coec.io.baseline_file import save_baseline
 from coec.io.serialise import matrix_of
 from coec.io.storage import StateFile
-from coec.service.ingest.pair_stream import PairStream
+from coec.service.engine.pair_stream import PairStream
 from coec.service.recording.window_store import start_ns_of
 from support.estimates import a_baseline
 from support.vehicles import (

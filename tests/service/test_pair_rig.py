@@ -26,8 +26,8 @@ from coec.service.api.command_execution import RigCommands
 from coec.service.api.rig_answers import RigAnswers
 from coec.service.camera_lidar_pair import Pair
 from coec.service.cpu_budget import Budget
-from coec.service.engine.rig_estimator_thread import RigEstimatorThread
-from coec.service.ingest.intake import Call, Intake
+from coec.service.engine.rig import RigEstimatorThread
+from coec.service.engine.vehicle import Call, Intake
 from coec.service.recording.window_store import WindowStore
 from coec.service.records.state_store import StateStore
 from coec.service.vehicle_context import VehicleContext

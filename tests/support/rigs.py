@@ -33,9 +33,9 @@ from coec.schemas.rig_state import LidarsReply, RigReply
 from coec.service.api.rig_answers import reply_of
 from coec.service.cpu_budget import Budget
 from coec.service.engine.lidar_pairs import LidarPairs
-from coec.service.engine.rig_estimator_thread import RigEstimatorThread, RigMember, RigSnapshot
+from coec.service.engine.rig import RigEstimatorThread, RigMember, RigSnapshot
+from coec.service.engine.vehicle import Intake
 from coec.service.ingest.decoder import EGO, Frame
-from coec.service.ingest.intake import Intake
 from coec.service.worker.supervisor import Worker
 from coec.service.worker.worker_jobs import (
     Answer,

@@ -62,8 +62,8 @@ from coec.service.api.uplink import Heartbeats, Uplink
 from coec.service.camera_lidar_pair import Pair
 from coec.service.configuration import redacted_configuration
 from coec.service.cpu_budget import Budget
-from coec.service.engine.rig_estimator_thread import RigEstimatorThread
-from coec.service.ingest.intake import Call, Intake
+from coec.service.engine.rig import RigEstimatorThread
+from coec.service.engine.vehicle import Call, Intake
 from coec.service.recording.recorder import RecordingPlan
 from coec.service.recording.snippets import SnippetRecorder
 from coec.service.recording.window_store import WindowStore

@@ -18,12 +18,12 @@ from coec.io.rig_files import rig_of
 from coec.service.api.command_execution import Commands
 from coec.service.api.pair_answers import PairAnswers
 from coec.service.configuration import settings_hash
-from coec.service.engine.calibration_manager import CalibrationManager
+from coec.service.engine.frame_selector import FrameSelector
 from coec.service.engine.job_client import IncidentPictures, JobClient
+from coec.service.engine.pair import CalibrationManager
+from coec.service.engine.pair_stream import PairStream
 from coec.service.engine.schedule import ResultSchedule
 from coec.service.ingest.frame_buffers import FrameRing
-from coec.service.ingest.frame_selector import FrameSelector
-from coec.service.ingest.pair_stream import PairStream
 from coec.service.recording.recorder import Recorder, RecordingPlan
 from coec.service.recording.snippets import SnippetRecorder
 from coec.service.records.pair_store import PairStore

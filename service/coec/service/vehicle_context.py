@@ -11,8 +11,8 @@ from coec.io.zenoh.ros_node import RosTopicList
 from coec.schemas.keys import Keys
 from coec.service.cpu_budget import Budget
 from coec.service.discovery_listener import NominalStatus
-from coec.service.engine.rig_estimator_thread import RigEstimatorThread
-from coec.service.ingest.intake import Intake
+from coec.service.engine.rig import RigEstimatorThread
+from coec.service.engine.vehicle import Intake
 from coec.service.recording.snippets import SnippetStore
 from coec.service.recording.window_store import WindowStore
 from coec.service.records.state_store import StateStore

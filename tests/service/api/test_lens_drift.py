@@ -16,9 +16,9 @@ from coec.reports import replies as shown
 from coec.schemas.message import to_json
 from coec.schemas.replies import HealthReply
 from coec.service.api.reply_builders import extrinsic_of, health_of
-from coec.service.engine.calibration_manager import PairSnapshot
-from coec.service.ingest.frame_selector import ServedExtrinsic
-from coec.service.ingest.pair_stream import StreamStatistics
+from coec.service.engine.frame_selector import ServedExtrinsic
+from coec.service.engine.pair import PairSnapshot
+from coec.service.engine.pair_stream import StreamStatistics
 from support.estimates import ESTIMATE_RIG, estimate
 
 RULES = PairRules(PolicyConfig(apply="always"), TrackerConfig(), MonitorConfig())

@@ -8,9 +8,9 @@ import pytest
 
 from coec.calibration.types import Reason
 from coec.service.engine.check_progress import Attempts, CheckProgress
+from coec.service.engine.frame_selector import SelectionStatistics
+from coec.service.engine.pair_stream import StreamStatistics
 from coec.service.ingest.decoder import CAMERA, LIDAR, StreamCounts
-from coec.service.ingest.frame_selector import SelectionStatistics
-from coec.service.ingest.pair_stream import StreamStatistics
 
 S = 1_000_000_000
 PERIOD_S = 5.0

@@ -29,10 +29,10 @@ from coec.schemas.replies import Acknowledgement, Candidate
 from coec.schemas.rig_state import RigReply
 from coec.service.api.pair_answers import PendingPairCommands
 from coec.service.api.reply_builders import candidate_of
-from coec.service.engine.calibration_manager import CalibrationManager
+from coec.service.engine.frame_selector import FrameSelector
 from coec.service.engine.job_client import JobClient
-from coec.service.ingest.frame_selector import FrameSelector
-from coec.service.ingest.pair_stream import PairStream
+from coec.service.engine.pair import CalibrationManager
+from coec.service.engine.pair_stream import PairStream
 from coec.service.recording.recorder import Recorder
 from coec.service.recording.window_store import WindowStore
 from coec.service.records.pair_store import MIN_HASH, PairStore

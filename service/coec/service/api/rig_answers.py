@@ -21,7 +21,7 @@ from coec.schemas.keys import Format, Keys
 from coec.schemas.replies import Maybe6x6, Vector6
 from coec.service.api.problems import rig_problems
 from coec.service.api.reply_builders import SerializedReply
-from coec.service.engine.rig_estimator_thread import ONE_PAIR, LidarPairStatus, RigSnapshot
+from coec.service.engine.rig import ONE_PAIR, LidarPairStatus, RigSnapshot
 
 
 class RigAnswers:

@@ -17,9 +17,9 @@ from coec.io.logs import LossCounter
 from coec.io.serialise import matrix_of
 from coec.schemas.replies import EvidenceEvent
 from coec.service.cpu_budget import Budget
-from coec.service.engine.rig_estimator_thread import PairCorrection, RigMember
+from coec.service.engine.frame_selector import ServedExtrinsic
+from coec.service.engine.rig import PairCorrection, RigMember
 from coec.service.engine.schedule import PendingRequest, ResultSchedule
-from coec.service.ingest.frame_selector import ServedExtrinsic
 from coec.service.recording.window_store import WindowStore, start_ns_of
 from coec.service.records.incidents import Side
 from coec.service.task_queue import TaskQueue

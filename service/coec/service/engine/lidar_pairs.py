@@ -22,9 +22,9 @@ from coec.config import LidarEdgesConfig, PairConfig
 from coec.io import nearest_neighbours
 from coec.io.rig_files import rig_of
 from coec.service.cpu_budget import Budget
-from coec.service.engine import rig_estimator_thread
+from coec.service.engine import rig
+from coec.service.engine.vehicle import Intake, SensorStream
 from coec.service.ingest.decoder import EGO, LIDAR, Frame
-from coec.service.ingest.intake import Intake, SensorStream
 from coec.service.timing import NS_PER_S
 from coec.service.worker import worker_jobs
 from coec.service.worker.supervisor import Worker
@@ -91,7 +91,7 @@ def plan_lidar_pairs(pairs: Iterable[PairConfig], period_s: float) -> tuple[Lida
     rigs = {pair.name: (pair, rig_of(pair)) for pair in pairs}
     lidars: dict[str, LidarOfPair] = {}
     for pair, rig in rigs.values():
-        name = rig_estimator_thread.sensors_of(pair)[1]
+        name = rig.sensors_of(pair)[1]
         lidars.setdefault(name, LidarOfPair(name, pair, rig))
     if len(lidars) < 2:
         return ()
@@ -111,7 +111,7 @@ def _places(pairs: Mapping[str, tuple[PairConfig, Matrix4]]) -> dict[str, Mappin
     """T_sensor_origin (4, 4) by origin and sensor, for sensors that are joined by pairs; empty if there are more
     sensors than a rig may have."""
     try:
-        graph = rig_estimator_thread.graph_of(pairs, ())
+        graph = rig.graph_of(pairs, ())
     except ValueError:
         return {}
     return {sensor.name: graph.joined_to(sensor.name) for sensor in graph.sensors}
@@ -176,7 +176,7 @@ class LidarPairStream:
         intake: Intake,
         worker: Worker,
         budget: Budget,
-        rig: rig_estimator_thread.RigEstimatorThread,
+        rig: rig.RigEstimatorThread,
     ):
         a, b = lidars.a.pair, lidars.b.pair
         assert a.ego is not None
@@ -206,7 +206,7 @@ class LidarPairStream:
         self._resting = 0
         self._missed = ""
         self._tried_ns: int | None = None
-        rig.join_lidars(rig_estimator_thread.LidarPairStatus(lidars.edge), lambda: self.unanswered == 0)
+        rig.join_lidars(rig.LidarPairStatus(lidars.edge), lambda: self.unanswered == 0)
         budget.join_checks(self._name, period_s)
         intake.join(self)
 
@@ -252,7 +252,7 @@ class LidarPairStream:
         """No look was possible; reports the cause to the rig if it is new."""
         if missed.cause != self._missed:
             self._missed = missed.cause
-            report = rig_estimator_thread.LidarPairReport(missed.stamp_ns, None, (MISSED[missed.cause],), self._lost())
+            report = rig.LidarPairReport(missed.stamp_ns, None, (MISSED[missed.cause],), self._lost())
             self._rig.put(self._name, missed.stamp_ns + COUNTS_AFTER_NS, report)
 
     # --- turns ------------------------------------------------------------------------------------------------------
@@ -314,21 +314,19 @@ class LidarPairStream:
         waits = any(pending.rests is None and pending.due_ns <= now_ns for pending in self._pending)
         self._rig.report_time(self._name, now_ns, waits=waits)
 
-    def _report_of(
-        self, pending: _PendingRegistration, outcome: JobOutcome
-    ) -> tuple[rig_estimator_thread.LidarPairReport, int]:
+    def _report_of(self, pending: _PendingRegistration, outcome: JobOutcome) -> tuple[rig.LidarPairReport, int]:
         """The outcome of a look, and how many looks are to be left out after it."""
         answer = outcome.answer
         if not isinstance(answer, Registered):
             reasons = () if outcome.reason is None else (outcome.reason,)
-            return rig_estimator_thread.LidarPairReport(pending.stamp_ns, None, reasons, pending.losses), 0
+            return rig.LidarPairReport(pending.stamp_ns, None, reasons, pending.losses), 0
         if answer.reasons:
             rests = RESTS if answer.share < lidar_sampling.LEAST_SHARE else 0
-            return rig_estimator_thread.LidarPairReport(pending.stamp_ns, None, answer.reasons, pending.losses), rests
+            return rig.LidarPairReport(pending.stamp_ns, None, answer.reasons, pending.losses), rests
         covariance = determined_covariance(answer.covariance)
         if covariance is None:
-            return rig_estimator_thread.LidarPairReport(pending.stamp_ns, None, (WEAK,), pending.losses), 0
-        registration = rig_estimator_thread.Registration(
+            return rig.LidarPairReport(pending.stamp_ns, None, (WEAK,), pending.losses), 0
+        registration = rig.Registration(
             observation_of_registration(self._name, pending.stamp_ns, answer.T_a_b, covariance),
             EdgeWindow(window_of(pending.stamp_ns, answer.T_a_b, covariance), pending.start_ns),
             answer.range_bias,
@@ -336,7 +334,7 @@ class LidarPairStream:
             answer.points,
             answer.share,
         )
-        return rig_estimator_thread.LidarPairReport(pending.stamp_ns, registration, (), pending.losses), 0
+        return rig.LidarPairReport(pending.stamp_ns, registration, (), pending.losses), 0
 
     # --- inside -----------------------------------------------------------------------------------------------------
 
@@ -364,7 +362,7 @@ class LidarPairs:
         intake: Intake,
         worker: Worker,
         budget: Budget,
-        rig: rig_estimator_thread.RigEstimatorThread,
+        rig: rig.RigEstimatorThread,
     ) -> None:
         self._period_s = config.period_s
         self._intake = intake
@@ -390,9 +388,7 @@ class LidarPairs:
                 LidarPairStream(lidars, self._period_s, self._intake, self._worker, self._budget, self._rig)
                 continue
             self._rig.join_lidars(
-                rig_estimator_thread.LidarPairStatus(
-                    lidars.edge, rig_estimator_thread.LidarState.NOT_MEASURED, (why_not,)
-                ),
+                rig.LidarPairStatus(lidars.edge, rig.LidarState.NOT_MEASURED, (why_not,)),
                 lambda: True,
             )
             if why_not is NOT_INSTALLED:

@@ -33,7 +33,7 @@ from coec.schemas.replies import (
     MetricsPoint,
     RetentionReason,
 )
-from coec.service.ingest.frame_selector import ServedExtrinsic
+from coec.service.engine.frame_selector import ServedExtrinsic
 from coec.service.recording.window_store import WindowStore, WindowVersion
 from coec.service.records.history import GENESIS, CheckLog, HistoryRecord, PairHistory
 from coec.service.records.incidents import Incidents, Side

@@ -13,10 +13,10 @@ from coec.calibration.frames.window import CarriedOverPairs
 from coec.calibration.types import FramePair, Matrix4
 from coec.config import Config, PairConfig
 from coec.io.logs import LossCounter
+from coec.service.engine.frame_selector import FrameSelector, SelectionStatistics, ServedExtrinsic
+from coec.service.engine.vehicle import Arrivals, Intake, SensorStream
 from coec.service.ingest.decoder import LIDAR, Frame, StreamCounts
 from coec.service.ingest.frame_buffers import FrameRing, PairBuffer
-from coec.service.ingest.frame_selector import FrameSelector, SelectionStatistics, ServedExtrinsic
-from coec.service.ingest.intake import Arrivals, Intake, SensorStream
 from coec.service.task_queue import DeferredCall
 from coec.service.timing import NS_PER_S, QUICK_S, Histogram, SensorClock
 

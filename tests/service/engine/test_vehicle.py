@@ -18,11 +18,11 @@ from coec.config import Config, KnownStreamConfig
 from coec.io.logs import LossCounter
 from coec.io.msgpack_frames import encode_camera, encode_ego, encode_lidar
 from coec.io.zenoh.bus import InputSample
-from coec.service.ingest import pair_stream
+from coec.service.engine import pair_stream
+from coec.service.engine.frame_selector import FrameSelector, SelectionStatistics
+from coec.service.engine.pair_stream import PairStream
+from coec.service.engine.vehicle import FRAMES_WAITING, Intake, read_alike
 from coec.service.ingest.decoder import CAMERA, EGO, LIDAR
-from coec.service.ingest.frame_selector import FrameSelector, SelectionStatistics
-from coec.service.ingest.intake import FRAMES_WAITING, Intake, read_alike
-from coec.service.ingest.pair_stream import PairStream
 from support.vehicles import HEIGHT, WIDTH, pair_configuration
 
 HZ10_NS = 100_000_000

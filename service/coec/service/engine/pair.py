@@ -30,11 +30,11 @@ from coec.io.system import ServiceThread
 from coec.reports.formatting import hold_text
 from coec.schemas.replies import CalibrationResult, CheckReply
 from coec.service.engine.check_progress import Attempts, CheckProgress
+from coec.service.engine.frame_selector import ServedExtrinsic
 from coec.service.engine.job_client import IncidentPictures
-from coec.service.engine.rig_estimator_thread import PairCorrection, RigMember
+from coec.service.engine.pair_stream import StreamStatistics
+from coec.service.engine.rig import PairCorrection, RigMember
 from coec.service.engine.schedule import Effect, PendingRequest, ResultSchedule, TakeResult
-from coec.service.ingest.frame_selector import ServedExtrinsic
-from coec.service.ingest.pair_stream import StreamStatistics
 from coec.service.recording.window_store import WindowVersion, start_ns_of
 from coec.service.records.pair_store import PairStore, StateTransition
 from coec.service.records.rig_store import RigBaseline

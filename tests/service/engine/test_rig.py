@@ -16,7 +16,7 @@ from coec.schemas.message import from_json, to_json
 from coec.schemas.rig_state import RigReply
 from coec.service.api.problems import INCONSISTENT, rig_problems
 from coec.service.api.rig_answers import RigAnswers, reply_of
-from coec.service.engine.rig_estimator_thread import LAG_NS, QUIET_TICKS
+from coec.service.engine.rig import LAG_NS, QUIET_TICKS
 from coec.service.records.rig_store import RIG_FILE, RigStore
 from support.rigs import (
     CAMERAS,
