@@ -61,10 +61,10 @@ STUBBORN = (
     "-c",
     "import sys\n"
     "from coec.io.zenoh.bus import Bus\n"
-    "from coec.service.camera_lidar_pair import Pair\n"
+    "from coec.service.camera_lidar_pair import CameraLidarPair\n"
     "def broken(*_):\n"
     "    raise RuntimeError('broken')\n"
-    "Bus.undeclare_inputs = Bus.undeclare_queryables = Pair.finish_window = broken\n"
+    "Bus.undeclare_inputs = Bus.undeclare_queryables = CameraLidarPair.finish_window = broken\n"
     "from coec.cli.main import main\n"
     "sys.exit(main())",
 )

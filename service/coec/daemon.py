@@ -7,7 +7,7 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 from coec import __version__
@@ -38,17 +38,16 @@ from coec.service.api.reply_builders import SerializedReply, budget_status_of, w
 from coec.service.api.rig_answers import RigAnswers
 from coec.service.api.routes import VehicleRoutes
 from coec.service.api.uplink import Heartbeats, Uplink
-from coec.service.camera_lidar_pair import Pair
+from coec.service.camera_lidar_pair import CameraLidarPair
 from coec.service.configuration import redacted_configuration, reload_of, settings_hash
 from coec.service.cpu_budget import Budget
 from coec.service.discovery import completed
 from coec.service.engine.lidar_pairs import LidarPairs
-from coec.service.engine.pair import CalibrationManager
-from coec.service.engine.rig import RigEstimatorThread
-from coec.service.engine.vehicle import Intake
+from coec.service.engine.rig import RigEstimator
+from coec.service.engine.vehicle import Vehicle
 from coec.service.pending_pairs import PendingPairs
 from coec.service.process_lifetime import FolderLock, Signals, attempt, handled_signals, joined, locked, stopped
-from coec.service.recording.recorder import Recorder
+from coec.service.recording.recorder import RecordingThread
 from coec.service.recording.snippets import SnippetStore
 from coec.service.recording.window_store import WindowStore
 from coec.service.records.state_store import StateStore
@@ -78,7 +77,7 @@ STALLED_S = 20.0
 start gets no more time."""
 
 # With these time limits, and because the worker is killed, the service ends in less than 15 s.
-INGEST_STOP_S, RECORDER_STOP_S, MANAGER_STOP_S, RIG_STOP_S, DISK_WRITER_STOP_S = 2.0, 4.0, 0.5, 0.5, 1.5
+ENGINE_STOP_S, RECORDER_STOP_S, DISK_WRITER_STOP_S = 2.5, 4.0, 1.5
 QUERIES_STOP_S, HTTP_STOP_S, ROS_STOP_S, LISTENER_STOP_S, SESSION_STOP_S, WORKER_STOP_S = 1.0, 0.5, 0.5, 1.5, 2.5, 1.0
 
 
@@ -138,23 +137,36 @@ class Daemon:
         store = StateStore(config.state.directory, config.vehicle)
         self._disk_writer = DiskWriter(config.state.directory)
         self._disk_writer.register(lock, self._folder)
-        self._rig = RigEstimatorThread(config.state.directory, config.links, self._disk_writer)
         self._rig_answers = RigAnswers(self._keys, self._publish)
-        own = (self._worker, self._budget, self._rig, self._publish, self._problems, self._ros_outputs.show)
-        of_ros = (self._ros_side.topics, self._pending_pairs.nominal)
-        self._intake = Intake(config.limits, config.snippets.memory_bytes)
-        shared = (*own, *of_ros, self._rig_answers.problems)
+        rig = RigEstimator(config.state.directory, config.links, self._disk_writer)
+        self._vehicle = Vehicle(
+            config.limits, self._budget, rig, self._rig_answers.on_update, config.snippets.memory_bytes
+        )
+        self._disk_writer.on_written(self._vehicle.inbox.wake)  # what waits for the disk can be published
+        self._recording = RecordingThread()
         snippets = _snippets_of(config)
         if snippets is not None:
             self._disk_writer.register(snippets)
         self._context = VehicleContext(
-            self._keys, self._intake, store, self._disk_writer, self._folder, *shared, snippets=snippets
+            keys=self._keys,
+            vehicle=self._vehicle,
+            store=store,
+            disk_writer=self._disk_writer,
+            folder=self._folder,
+            recording=self._recording,
+            worker=self._worker,
+            publish=self._publish,
+            vehicle_problems=self._problems,
+            show=self._ros_outputs.show,
+            topics=self._ros_side.topics,
+            nominal=self._pending_pairs.nominal,
+            rig_problems=self._rig_answers.problems,
+            snippets=snippets,
         )
-        self._pairs = {pair.name: Pair(pair, config, self._context) for pair in config.pairs}
-        self._lidars = LidarPairs(config.lidar_edges, self._intake, self._worker, self._budget, self._rig)
+        self._pairs = {pair.name: CameraLidarPair(pair, config, self._context) for pair in config.pairs}
+        self._lidars = LidarPairs(config.lidar_edges, self._vehicle, self._worker)
         self._lidars.grow(config.pairs)
-        self._rig.connect(self._rig_answers.on_update, self._intake.inbox.wake)
-        while self._rig.work(0.0):  # so that a reply exists before the first question
+        while self._vehicle.turn(0.0):  # so that a reply exists before the first query
             pass
         pending = self._pending_pairs.open(config, self._context)
         self._commands: dict[str, Commands | PendingPairCommands] = {
@@ -209,9 +221,9 @@ class Daemon:
     def _start(self) -> None:
         for thread in (
             self._disk_writer.thread,
-            self._rig.thread,
+            self._recording.thread,
             self._presence.thread,
-            self._intake.thread,
+            self._vehicle.thread,
             *self._bus.threads,
         ):
             thread.start()
@@ -220,7 +232,7 @@ class Daemon:
         self._worker.start()
         self._answers.declare(self._bus)
         self._metrics_server.reconfigure(self._config.metrics)
-        self._run(self._pairs.values())
+        self._subscribe()
         self._pending_pairs.listen(self._bus, self._ros_side)
         for name in (each.name for each in self._config.every_pair):
             self._bus.declare_alive(self._keys.alive(name))
@@ -237,12 +249,9 @@ class Daemon:
             },
         )
 
-    def _run(self, pairs: Iterable[Pair]) -> None:
-        """Starts pairs that are built, and subscribes to their streams that no earlier pair has."""
-        for pair in pairs:
-            for thread in (pair.manager.thread, pair.recorder.thread):
-                thread.start()
-        self._intake.listen(lambda stream, take: self._bus.subscribe(self._ros_side.input_of(stream), take))
+    def _subscribe(self) -> None:
+        """Subscribes to the streams of all pairs that are not subscribed to yet."""
+        self._vehicle.listen(lambda stream, take: self._bus.subscribe(self._ros_side.input_of(stream), take))
 
     def _admit(self) -> None:
         """Builds and starts the awaited pairs whose configuration is complete by now."""
@@ -251,14 +260,14 @@ class Daemon:
             return
         whole = completed(self._config, discovered)
         self._worker.reconfigure(whole.model_dump_json())
-        fresh = {name: Pair(config, whole, self._context) for name, config in discovered.items()}
+        fresh = {name: CameraLidarPair(config, whole, self._context) for name, config in discovered.items()}
         self._pairs = {**self._pairs, **fresh}  # first, because the configuration names them
         self._config = whole
         self._lidars.grow(whole.pairs)
         for name, pair in fresh.items():
             self._commands[name] = pair.commands
             self._answers.replace(pair.answers)
-        self._run(fresh.values())
+        self._subscribe()
         self._command_handler.reconfigure(self._rules)  # for the commands of new pairs, too
         self._shown = self._shown_now()
         fields = {"pairs": list(discovered), "config_hash": config_hash(self._config)}
@@ -310,18 +319,16 @@ class Daemon:
         _log.info("stopping")
         if self._state != "failing":
             self._state = "stopping"
-        pairs = self._pairs.values()
         steps: tuple[tuple[str, Callable[[], object]], ...] = (
             ("announce", self._notifier.stopping),
             ("tell", self._renew),
             ("take no more samples", self._bus.undeclare_inputs),
             ("look for no more pairs", lambda: stopped(self._pending_pairs.threads, LISTENER_STOP_S)),
-            ("end the intake", self._end_intake),
+            ("end the engine", self._end_engine),
             ("finish the open windows", self._finish_windows),
-            ("end the recorders", lambda: self._end(pairs, lambda pair: pair.recorder, RECORDER_STOP_S)),
+            ("end the recorders", self._end_recording),
             ("end the worker", self._worker.request_stop),
-            ("end the deciders", lambda: self._end(pairs, lambda pair: pair.manager, MANAGER_STOP_S)),
-            ("end the rig", self._end_rig),
+            ("take the last outcomes", self._finish_pairs),
             ("write all that is to be remembered", self._end_disk_writer),
             ("end the answers", lambda: stopped(self._bus.threads, QUERIES_STOP_S)),
             ("stop serving HTTP", lambda: self._metrics_server.close(HTTP_STOP_S)),
@@ -337,29 +344,30 @@ class Daemon:
         _log.info("stopped", extra={"fields": {"session_closed": closed}})
         return bool(guard_closed and closed)
 
-    @staticmethod
-    def _end(pairs: Iterable[Pair], part: Callable[[Pair], Recorder | CalibrationManager], within_s: float) -> None:
-        for pair in pairs:
-            part(pair).request_stop()
-        joined([part(pair).thread for pair in pairs], within_s)
+    def _end_engine(self) -> None:
+        self._vehicle.request_stop()
+        joined([self._vehicle.thread], ENGINE_STOP_S)
 
-    def _end_intake(self) -> None:
-        self._intake.request_stop()
-        joined([self._intake.thread], INGEST_STOP_S)
-
-    def _end_rig(self) -> None:
-        self._rig.request_stop()
-        joined([self._rig.thread], RIG_STOP_S)
+    def _end_recording(self) -> None:
+        self._recording.request_stop()
+        joined([self._recording.thread], RECORDER_STOP_S)
 
     def _end_disk_writer(self) -> None:
         self._disk_writer.request_stop()
         joined([self._disk_writer.thread], DISK_WRITER_STOP_S)
 
     def _finish_windows(self) -> None:
-        """Finishes the open windows if the intake has ended. While it runs, only its thread may touch them."""
-        if self._intake.thread.join(0.0):
+        """Finishes the open windows if the engine has ended. While it runs, only its thread may touch them."""
+        if self._vehicle.thread.join(0.0):
             for pair in self._pairs.values():
                 attempt("finish a window", pair.finish_window)
+
+    def _finish_pairs(self) -> None:
+        """Takes the outcomes that have come since the engine ended, and saves what is known."""
+        if self._vehicle.thread.join(0.0):
+            attempt("take the last outcomes", self._vehicle.finish)
+            for pair in self._pairs.values():
+                attempt("save the state", pair.engine.store.save)
 
     def _reload(self, reread: Callable[[], Config] | None) -> None:
         """On SIGHUP: reads the configuration again and takes over what can change without a restart. A file with which
@@ -456,17 +464,15 @@ class Daemon:
 
     def _threads(self) -> list[ServiceThread]:
         """All of them."""
-        recorders = [pair.recorder.thread for pair in self._pairs.values()]
         door = [] if self._metrics_server.server is None else [self._metrics_server.server.thread]
         waiting = [thread for thread in self._bus.threads if thread not in self._bus.prompt_threads]
-        return [*self._prompt_threads(), self._disk_writer.thread, *waiting, *door, *recorders]
+        return [*self._prompt_threads(), self._disk_writer.thread, *waiting, *door, self._recording.thread]
 
     def _prompt_threads(self) -> list[ServiceThread]:
         """The threads that never wait for a disk. Only these must beat: a thread that waits for a slow disk may stand
         still as long as the disk takes. `health` reports that, and a restart would not make the disk quicker."""
-        own = [self._intake.thread, self._rig.thread, *(pair.manager.thread for pair in self._pairs.values())]
         of_ros = (*self._pending_pairs.threads, *self._ros_outputs.threads)
-        return [self._presence.thread, *self._bus.prompt_threads, self._worker.thread, *of_ros, *own]
+        return [self._presence.thread, *self._bus.prompt_threads, self._worker.thread, *of_ros, self._vehicle.thread]
 
     def _renew(self) -> None:
         self._pending_pairs.renew()
@@ -538,7 +544,7 @@ class Daemon:
         took = {
             metrics.QUERY: [LabelledHistogram((), self._answers.took)],
             metrics.DECODE: [
-                LabelledHistogram((sensor.config.sensor,), sensor.took) for sensor in self._intake.sensors
+                LabelledHistogram((sensor.config.sensor,), sensor.took) for sensor in self._vehicle.sensors
             ],
             metrics.PAIR_WAIT: [LabelledHistogram((name,), pair.stream.waiting_took) for name, pair in pairs],
             metrics.WRITE: [LabelledHistogram((name,), pair.recorder.writing_took) for name, pair in pairs],

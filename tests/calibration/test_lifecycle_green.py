@@ -20,8 +20,7 @@ from coec.calibration.state import ExtrinsicHold, PairState
 from coec.calibration.state_machine import HealthState
 from coec.calibration.types import Decision, Estimate
 from coec.service.engine.check_progress import CheckProgress
-from coec.service.engine.frame_selector import SelectionStatistics
-from coec.service.engine.pair_stream import StreamStatistics
+from coec.service.engine.messages import SelectionStatistics, StreamStatistics
 from coec.service.ingest.decoder import CAMERA, LIDAR, StreamCounts
 
 S = 1_000_000_000

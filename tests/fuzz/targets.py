@@ -67,6 +67,7 @@ from coec.service.discovery import NOMINAL_FILE, DiscoveredPair, DiscoveryStore
 from coec.service.recording.window_store import WindowStore
 from coec.service.records.pair_store import PairStore
 from coec.service.records.state_store import Clocks, StateStore
+from coec.service.timing import Clock
 from coec.service.worker.child_process import Link, MalformedMessageError
 from coec.service.worker.worker_jobs import (
     Kind,
@@ -576,6 +577,7 @@ def _started(folder: Path) -> None:
         InstantDiskWriter(folder),
         WindowStore(folder / "windows", config),
         LossCounter(LOG, "front"),
+        Clock(),
     )
     state = store.state
     accepted = None if state.accepted is None else result_of(state.accepted, ESTIMATE_RIG, VEHICLE)

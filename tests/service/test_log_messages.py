@@ -14,8 +14,8 @@ from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFo
 from coec.io.frame_validation import Refusal
 from coec.io.logs import LOST, LossCounter, loss_text
 from coec.service.engine import frame_selector
-from coec.service.engine.vehicle import QUIET_S, RATE_FRAMES, SILENT_S, StreamLog
 from coec.service.ingest.decoder import EXPLAINED
+from coec.service.ingest.sensor_stream import QUIET_S, RATE_FRAMES, SILENT_S, StreamLog
 from coec.service.worker.compilation import Compiling
 from support.vehicles import BEGIN_S, DRIVE_END_S, NS_PER_S, STEP_S, PairBench, SlowWorker, frame_pair_at
 
@@ -73,7 +73,7 @@ def test_checks_are_logged_when_what_they_say_changes(tmp_path: Path, caplog: py
     caplog.set_level(logging.INFO)
     bench = PairBench(tmp_path / "state")
     bench.drive(BEGIN_S, STEP_S)
-    assert bench.pair.manager.snapshot().checks > 10
+    assert bench.pair.engine.snapshot().checks > 10
     assert len([line for line in lines(caplog) if line.startswith("checks: ")]) < 5
 
 
@@ -83,13 +83,13 @@ def test_checks_that_the_worker_did_not_begin_do_not_make_the_monitor_blind(
     bench = PairBench(tmp_path / "state")
     bench.worker.fault = Compiling(3, 38, 1.0).reason
     bench.drive(BEGIN_S, BEGIN_S + 60)
-    codes = {reason.code for reason in bench.pair.manager.snapshot().problems}
+    codes = {reason.code for reason in bench.pair.engine.snapshot().problems}
     assert "monitor_blind" not in codes
     assert bench.losses["monitor", "check_compiling_kernels"] > 3
     assert any("compiles its kernels" in line for line in lines(caplog))
     bench.worker.fault = Reason("dark", "It is dark.")
     bench.drive(BEGIN_S + 60, BEGIN_S + 120)
-    assert "monitor_blind" in {reason.code for reason in bench.pair.manager.snapshot().problems}
+    assert "monitor_blind" in {reason.code for reason in bench.pair.engine.snapshot().problems}
 
 
 def test_the_stream_does_not_wait_for_a_worker_that_compiles_its_kernels(tmp_path: Path) -> None:
@@ -97,15 +97,15 @@ def test_the_stream_does_not_wait_for_a_worker_that_compiles_its_kernels(tmp_pat
 
     def drive(begin_s: int, end_s: int) -> None:
         for stamp_ns in range(begin_s * NS_PER_S, end_s * NS_PER_S, NS_PER_S // 2):
-            bench.pair.stream.take([frame_pair_at(stamp_ns)])
-            while bench.pair.stream.choose_next():
+            bench.hold(frame_pair_at(stamp_ns))
+            while bench.pair.advance():
                 pass
 
     drive(BEGIN_S, BEGIN_S + 60)
-    assert len(bench.pair.stream._held) > 0
+    assert len(bench.pair.stream.held) > 0
     bench.worker.warms_up = True
     drive(BEGIN_S + 60, BEGIN_S + 120)
-    assert len(bench.pair.stream._held) == 0
+    assert len(bench.pair.stream.held) == 0
     assert ("monitor", "not_awaited") not in bench.losses
     assert bench.recorder.recorded > 1, "windows are recorded meanwhile"
 

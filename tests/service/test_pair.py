@@ -80,7 +80,7 @@ def test_every_event_is_reported_to_whoever_keeps_the_seconds_around_it(
 ) -> None:
     reported: list[tuple[str, float]] = []
     monkeypatch.setattr(
-        PairStream, "event", lambda _, name, pose: reported.append((name, float(np.abs(pose - AFTER).max())))
+        PairStream, "keep_snippet", lambda _, name, pose: reported.append((name, float(np.abs(pose - AFTER).max())))
     )
     bench.drive(BEGIN_S, DRIVE_END_S)
     assert [name for name, _ in reported] == ["suspect", "miscalibrated"]
@@ -145,16 +145,16 @@ def test_a_worker_that_takes_its_time_changes_no_decision(undisturbed: PairBench
 def test_a_stream_that_has_waited_for_too_long_goes_on_and_says_so(tmp_path: Path) -> None:
     bench = PairBench(tmp_path / "state", worker=SlowWorker)
     for stamp_ns in range(BEGIN_S * NS_PER_S, (BEGIN_S + 60) * NS_PER_S, NS_PER_S // 2):
-        bench.pair.stream.take([frame_pair_at(stamp_ns)])
-        while bench.pair.stream.choose_next():
+        bench.hold(frame_pair_at(stamp_ns))
+        while bench.pair.advance():
             pass
-    waiting = len(bench.pair.stream._held)
+    waiting = len(bench.pair.stream.held)
     assert waiting > 0
     assert ("monitor", "not_awaited") not in bench.losses
-    bench.intake.waiting_frames._max_bytes = 0
-    while bench.pair.stream.choose_next():
+    bench.vehicle.waiting_frames._max_bytes = 0
+    while bench.pair.advance():
         pass
-    assert len(bench.pair.stream._held) == 0
+    assert len(bench.pair.stream.held) == 0
     assert bench.losses["monitor", "not_awaited"] == waiting
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import pytest
@@ -46,7 +45,7 @@ def test_a_pair_that_is_not_afforded_is_never_silently_green(tmp_path: Path) -> 
     bench = driven(tmp_path, 0.01, {Kind.CHECK: 2.0}, BEGIN_S + 75)  # a window that is judged at 40 s is as good
     assert len(bench.worker.checked) == 1
     assert bench.losses["monitor", "check_not_afforded"] >= 10
-    bench.pair.manager.check_clocks(time.monotonic())
+    bench.check_clocks()
     health = bench.answers.health_reply
     assert health.state == "degraded"
     assert any(reason.code.startswith("overdue_") for reason in health.reasons), "which one is told by what came"
@@ -58,8 +57,8 @@ def test_slices_are_longer_where_windows_are_not_all_afforded(tmp_path: Path) ->
     bench.drive(STEP_S - 260, STEP_S)
     assert bench.budget.stretch == pytest.approx(2.0)
     spans_s = [(stamps[-1] - stamps[0]) / 1e9 for stamps in bench.recorder.stamps.values()]
-    assert spans_s[0] < 40.0, "what a window costs is known when the first has been solved"
-    assert min(spans_s[1:]) > 60.0
+    assert max(spans_s[:2]) < 40.0, "what a window costs is known when the first is solved, and the second has begun"
+    assert min(spans_s[2:]) > 60.0
 
 
 def test_a_suspicion_is_reported_to_the_budget_until_it_is_over(tmp_path: Path) -> None:

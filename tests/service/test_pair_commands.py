@@ -25,6 +25,7 @@ from coec.service.api.reply_builders import SerializedReply
 from coec.service.api.rig_answers import RigAnswers
 from coec.service.api.routes import VehicleRoutes
 from coec.service.api.uplink import Heartbeats, Uplink
+from coec.service.engine.messages import CommissioningSubject, JobDone
 from coec.service.worker.worker_jobs import Commissioned, Fate, JobOutcome, Kind, WorkerJob
 from support.estimates import a_baseline
 from support.vehicles import BEGIN_S, DRIVE_END_S, STEP_S, OracleWorker, PairBench
@@ -182,7 +183,7 @@ def test_windows_that_a_pair_was_commissioned_from_are_retained_for_that_across_
     bench.drive(BEGIN_S, BEGIN_S + 90)
     first, *others = [result.window_id for result in bench.store.history.results()]
     report = JobOutcome(Fate.RESULT, Commissioned(bench.pose, "0123abcd", 1, 10), None, 1.0)
-    bench.pair.manager.commissioned((first,), report)
+    bench.pair.on_event(JobDone(CommissioningSubject((first,)), report))
     bench.settle()
 
     def retained_for() -> dict[str, str | None]:

@@ -21,6 +21,7 @@ from coec.calibration.frames.pairing import MOTION_LATE_NS
 from coec.calibration.frames.window import SliceClosed
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4
 from coec.config import LimitsConfig
+from coec.service.engine.messages import Action
 from coec.service.worker.worker_jobs import Kind, WorkerJob, unpack_pairs
 from support.vehicles import BEGIN_S, DRIVE_END_S, NS_PER_S, OracleWorker, PairBench, SlowWorker, frame_pair_at
 
@@ -85,16 +86,16 @@ class Watched:
         self.checks: list[Any] = []
         bench = self.bench
         bench.recorder.sees_moves = True
-        choose, add, end, query = (
-            bench.pair._selector.choose,
+        select, add, end, query = (
+            bench.pair.engine.selector.select,
             bench.recorder.add,
             bench.recorder.end,
             bench.worker.submit,
         )
 
-        def selected(pair: FramePair) -> None:
+        def selected(pair: FramePair) -> list[Action]:
             self.checked.append((pair.camera.stamp_ns, pair.lidar.stamp_ns, pair.motion))
-            choose(pair)
+            return select(pair)
 
         def added(window_id: str, pair: FramePair, T_camera_lidar: Matrix4) -> None:
             self.windows.append((window_id, pair.stamp_ns, T_camera_lidar.tobytes()))
@@ -110,7 +111,7 @@ class Watched:
                 self.checks.append((job.body["pose"], [(pair.stamp_ns, pair.motion) for pair in pairs]))
             query(job)
 
-        bench.pair._selector.choose = selected  # type: ignore[method-assign]
+        bench.pair.engine.selector.select = selected  # type: ignore[method-assign]
         bench.recorder.add, bench.recorder.end = added, finished  # type: ignore[method-assign]
         bench.worker.submit = requested  # type: ignore[method-assign]
 
@@ -120,7 +121,7 @@ class Watched:
 
     def finish(self) -> None:
         """The streams have ended, and all is judged."""
-        self.bench.pair.stream._hold(self.bench.pair.stream._pairer.flush())
+        self.bench.pair.stream.flush()
         for _ in range(1000):
             if isinstance(self.bench.worker, SlowWorker):
                 self.bench.worker.work(share=1.0)
@@ -181,7 +182,7 @@ def disturbed(folder: Path, seed: int, clock: Clock) -> dict[str, Any]:
     bench = watched.bench
     assert isinstance(bench.worker, SlowWorker)
     bench.worker.rng = rng
-    stream, waiting = bench.pair.stream, streams()
+    waiting = streams()
     last_ns = 0
     favourite = "camera"
     while any(waiting.values()):
@@ -198,9 +199,9 @@ def disturbed(folder: Path, seed: int, clock: Clock) -> dict[str, Any]:
             bench.worker.work(share=1.0)
             bench.settle()
             clock.now_s += STALL_S
-            bench.pair.manager.check_clocks(clock.now_s)
+            bench.check_clocks()
         watched.push(frame)
-        stream.tick(waiting=False)
+        bench.pair.tick(waiting=False)
     watched.finish()
     assert "degraded" in [entry.code for entry in bench.entries("state")], "checks were overdue"
     return watched.reported
@@ -214,7 +215,7 @@ def wait_in_silence(watched: Watched, clock: Clock) -> None:
         clock.now_s += STALL_S / 20
         bench.worker.work(share=0.5)
         bench.settle()
-        bench.pair.stream.tick(waiting=False)
+        bench.pair.tick(waiting=False)
     assert isinstance(watched.windows[-1], SliceClosed), "silence ends the slice"
 
 

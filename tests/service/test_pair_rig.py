@@ -24,10 +24,11 @@ from coec.schemas.rig_state import RigReply
 from coec.service import camera_lidar_pair as runtime_pair
 from coec.service.api.command_execution import RigCommands
 from coec.service.api.rig_answers import RigAnswers
-from coec.service.camera_lidar_pair import Pair
+from coec.service.camera_lidar_pair import CameraLidarPair
 from coec.service.cpu_budget import Budget
-from coec.service.engine.rig import RigEstimatorThread
-from coec.service.engine.vehicle import Call, Intake
+from coec.service.engine.rig import RigEstimator
+from coec.service.engine.vehicle import Vehicle
+from coec.service.recording.recorder import RecordingThread
 from coec.service.recording.window_store import WindowStore
 from coec.service.records.state_store import StateStore
 from coec.service.vehicle_context import VehicleContext
@@ -74,63 +75,52 @@ class RigBench:
         folder.mkdir(parents=True)
         config = config or _configuration(folder, "within_limits")
         self.rng = random.Random(seed)
-        self.intake = Intake(config.limits)
         self.keys = Keys("coec", config.vehicle)
         disk_writer: DiskWriter = InstantDiskWriter(folder)
-        self.rig = RigEstimatorThread(folder, (), disk_writer)
         self.answers = RigAnswers(self.keys, lambda *_: None)
+        rig = RigEstimator(folder, (), disk_writer)
+        self.vehicle = Vehicle(config.limits, Budget(config.budget, lambda: 0.0), rig, self.answers.on_update)
         windows = WindowStore(folder / "windows", config.state)
         context = VehicleContext(
             self.keys,
-            self.intake,
+            self.vehicle,
             StateStore(folder, config.vehicle),
             disk_writer,
             windows,
+            RecordingThread(),
             cast("Worker", None),
-            Budget(config.budget, lambda: 0.0),
-            self.rig,
             lambda *_: None,
             lambda: (),
             lambda *_: None,
             RosTopicList,
             rig_problems=self.answers.problems,
         )
-        self.pairs: dict[str, Pair] = {}
+        self.pairs: dict[str, CameraLidarPair] = {}
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(runtime_pair, "Recorder", InstantRecorder)
             for pair in config.pairs:
                 worker = DimWorker() if pair.name == dim else OracleWorker()
-                object.__setattr__(context, "worker", worker)
-                self.pairs[pair.name] = Pair(pair, config, context)
+                own = replace(context, worker=cast("Worker", worker))
+                self.pairs[pair.name] = CameraLidarPair(pair, config, own)
                 cast("InstantRecorder", self.pairs[pair.name].recorder).worker = worker
-        self.rig.connect(self.answers.on_update, lambda: None)
         self.settle()
 
     def drive(self, begin_s: int, end_s: int) -> None:
         """Pairs of frames, twice a second, of each pair in turn; each is settled some time later."""
         for stamp_ns in range(begin_s * NS_PER_S, end_s * NS_PER_S, NS_PER_S // 2):
             for name in self.rng.sample(CAMERAS, 3):
-                self.pairs[name].stream.take([frame_pair_at(stamp_ns)])
+                self.pairs[name].stream.hold([frame_pair_at(stamp_ns)], set_clock=True)
                 if self.rng.random() < 0.7:
                     self.settle()
         self.settle()
 
     def settle(self) -> None:
-        """What the threads do until there is nothing more that they may do."""
-        going = True
-        while going:
-            going = False
-            while isinstance(item := self.intake.inbox.take(0.0), Call):
-                item.run()
-                going = True
-            for name in self.rng.sample(CAMERAS, 3):
-                pair = self.pairs[name]
-                going |= pair.stream.choose_next()
-                pair.stream.renew_report()
-                going |= pair.manager.work(0.0)
-                if self.rng.random() < 0.5:
-                    going |= self.rig.work(0.0)
-            going |= self.rig.work(0.0)
+        """What the engine does until there is nothing more that it may do."""
+        while self.vehicle.turn(0.0):
+            pass
+        for pair in self.pairs.values():
+            pair.stream.renew_report(pair.engine.selector.statistics)
+            pair._tick()
 
     def do(self, name: str, **arguments: Any) -> Acknowledgement:
         """A command for the rig."""

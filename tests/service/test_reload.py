@@ -179,11 +179,11 @@ def test_a_policy_holds_from_the_next_answer_on(tmp_path: Path) -> None:
 def test_the_length_of_windows_holds_from_the_next_slice_on(tmp_path: Path) -> None:
     bench = PairBench(tmp_path / "state")
     bench.drive(BEGIN_S, BEGIN_S + 10)
-    end_ns = bench.pair._selector.slice_end_ns
+    end_ns = bench.pair.engine.selector.slice_end_ns
     use(bench, reloaded(bench.config, pairs__0__window__slice_s=20.0, pairs__0__window__min_pairs=6))
-    assert bench.pair._selector.slice_end_ns == end_ns, "the open one ends as it began"
+    assert bench.pair.engine.selector.slice_end_ns == end_ns, "the open one ends as it began"
     bench.drive(BEGIN_S + 10, BEGIN_S + 45)
-    assert bench.pair._selector.slice_end_ns == (BEGIN_S + 60) * 10**9, "the next one has its own length"
+    assert bench.pair.engine.selector.slice_end_ns == (BEGIN_S + 60) * 10**9, "the next one has its own length"
 
 
 def test_checks_and_windows_say_by_which_settings(tmp_path: Path) -> None:

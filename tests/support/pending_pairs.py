@@ -73,7 +73,6 @@ class World:
             nothing,
             nothing,
             nothing,
-            nothing,
             lambda key, answer: self.published.append((key, answer)),
             lambda: self.problems,
             lambda *_: None,

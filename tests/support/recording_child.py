@@ -16,7 +16,7 @@ from coec.config import CalibrationConfig, StateConfig
 from coec.geometry.cameras import build
 from coec.io.logs import LossCounter
 from coec.service.ingest.frame_buffers import Snippet
-from coec.service.recording.recorder import Recorder, RecordingPlan
+from coec.service.recording.recorder import Recorder, RecordingPlan, RecordingThread
 from coec.service.recording.snippets import SnippetRecorder, SnippetStore
 from coec.service.recording.window_store import WindowStore
 from support.fake_worker import wait_until
@@ -45,18 +45,19 @@ def stores(folder: Path) -> tuple[WindowStore, SnippetStore]:
 
 def recorder_of(
     windows: WindowStore, snippets: SnippetStore, recorded: list[str]
-) -> tuple[Recorder, SnippetRecorder, LossCounter]:
+) -> tuple[RecordingThread, Recorder, SnippetRecorder, LossCounter]:
     losses = LossCounter(logging.getLogger("test"), "front")
     neighbour = SnippetRecorder(RIG, {"vehicle": "test"}, snippets, losses, packed=True)
-    finished = recorded.append
-    return Recorder(PLAN, windows, losses, lambda name, *_: finished(name), finished, neighbour), neighbour, losses
+    recording = RecordingThread()
+    recorder = Recorder(PLAN, windows, losses, recording, lambda _, event: recorded.append(event.window_id), neighbour)
+    return recording, recorder, neighbour, losses
 
 
 def run(folder: Path, life: int) -> None:
     windows, snippets = stores(folder)
     finished: list[str] = []
-    recorder, neighbour, _ = recorder_of(windows, snippets, finished)
-    recorder.thread.start()
+    recording, recorder, neighbour, _ = recorder_of(windows, snippets, finished)
+    recording.thread.start()
     reported: set[str] = set()
     for number in itertools.count(1):
         begin_ns = (1_700_000_000 + life * 1_000_000 + number * 10) * S

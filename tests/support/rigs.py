@@ -33,8 +33,8 @@ from coec.schemas.rig_state import LidarsReply, RigReply
 from coec.service.api.rig_answers import reply_of
 from coec.service.cpu_budget import Budget
 from coec.service.engine.lidar_pairs import LidarPairs
-from coec.service.engine.rig import RigEstimatorThread, RigMember, RigSnapshot
-from coec.service.engine.vehicle import Intake
+from coec.service.engine.rig import RigEstimator, RigMember, RigSnapshot
+from coec.service.engine.vehicle import Vehicle
 from coec.service.ingest.decoder import EGO, Frame
 from coec.service.worker.supervisor import Worker
 from coec.service.worker.worker_jobs import (
@@ -162,7 +162,7 @@ def served_extrinsic(camera: str, poses: CameraPoses, start_s: float) -> ServedE
 
 
 class RigEstimatorBench:
-    """The rig's thread, done by the test.
+    """The rig, whose turns the test does.
 
     Attributes:
         pairs: by camera.
@@ -171,19 +171,19 @@ class RigEstimatorBench:
 
     def __init__(self, folder: Path, cameras: tuple[str, ...] = CAMERAS, poses: CameraPoses = POSES) -> None:
         self.disk_writer = DiskWriter(folder)
-        self.estimator = RigEstimatorThread(folder, (), self.disk_writer)
+        self.estimator = RigEstimator(folder, (), self.disk_writer)
         self.states: list[RigSnapshot] = []
         self.pairs: dict[str, RigMember] = {}
         for camera in cameras:
             known = pair_state(camera, poses)
-            self.pairs[camera] = self.estimator.join(pair_config(camera), pair_pose(camera, POSES), known, lambda: True)
-        self.estimator.connect(self.states.append, lambda: None)
+            self.pairs[camera] = self.estimator.join(pair_config(camera), pair_pose(camera, POSES), known)
+        self.states.append(self.estimator.snapshot)
         self.settle()
 
     def settle(self) -> None:
-        """What the thread does until there is nothing to be done."""
-        while self.estimator.work(0.0):
-            pass
+        """What the engine does until there is nothing to be done."""
+        while self.estimator.take_report(all_are_silent=self.estimator.is_quiet):
+            self.states.append(self.estimator.snapshot)
 
     def put(self, camera: str, due_s: float, report: EdgeObservation | EdgeWindow | ServedEdge) -> None:
         """A pair says something."""
@@ -191,7 +191,8 @@ class RigEstimatorBench:
 
     def must_wait(self, camera: str, at_s: float, *, waits: bool = False) -> bool:
         """A pair has frames of this time; whether it has to wait for the rig."""
-        return self.pairs[camera].must_wait(round(at_s * NS), for_own=waits)
+        self.pairs[camera].report_time(round(at_s * NS), waits=waits)
+        return self.pairs[camera].waits(round(at_s * NS))
 
     @property
     def known(self) -> RigSnapshot:
@@ -279,27 +280,24 @@ class LidarBench:
         self.rng = random.Random(seed)
         self.late_s = 0.0 if seed is None else MORE_LATE_S
         self.slow = slow
-        self.intake = Intake(LimitsConfig())
-        self.estimator = RigEstimatorThread(folder, (), DiskWriter(folder))
+        self.estimator = RigEstimator(folder, (), DiskWriter(folder))
         self.worker = FakeLidarWorker(answers)
         self.budget = Budget(BudgetConfig(cores=cores), lambda: 0.0)
         self.states: list[RigSnapshot] = []
+        self.vehicle = Vehicle(LimitsConfig(), self.budget, self.estimator, self.states.append)
         self.ego = ego
         self.pairs: list[RigMember] = []
         configs = [self.join(lidar) for lidar in lidars]
         worker = cast("Worker", self.worker)
-        self.edges = LidarPairs(LidarEdgesConfig(period_s=period_s), self.intake, worker, self.budget, self.estimator)
+        self.edges = LidarPairs(LidarEdgesConfig(period_s=period_s), self.vehicle, worker)
         self.edges.grow(configs)
-        self.estimator.connect(self.states.append, lambda: None)
         self.settle()
 
     def join(self, lidar: str) -> PairConfig:
         """A pair of it becomes one of the rig."""
         config = lidar_pair(lidar, ego=self.ego)
-        self.intake.sensors_of(config)
-        self.pairs.append(
-            self.estimator.join(config, np.array(config.T_camera_lidar), pair_state("front"), lambda: True)
-        )
+        self.vehicle.sensors_of(config)
+        self.pairs.append(self.estimator.join(config, np.array(config.T_camera_lidar), pair_state("front")))
         return config
 
     def drive(self, begin_s: float, end_s: float, *, speed_mps: float = 8.0, timed: bool = True) -> None:
@@ -316,21 +314,21 @@ class LidarBench:
             self.push(stream, lidar_frame(stream, stamp_ns, speed_mps, timed=timed))
             if stream == LIDARS[0]:
                 for pair in self.pairs:
-                    pair.must_wait(stamp_ns, for_own=False)
+                    pair.report_time(stamp_ns, waits=False)
                 self.settle()
         self.settle()
 
     def push(self, stream: str, frame: Frame) -> None:
         """A frame came."""
-        for sensor in self.intake.sensors:
+        for sensor in self.vehicle.sensors:
             if sensor.config.sensor in (stream, f"in/{stream}"):
                 for taker in sensor.takers:
                     taker(frame)
 
     def settle(self) -> None:
-        """What the threads do until there is nothing more that they may do."""
+        """What the engine does until there is nothing more that it may do."""
         self.answer_some()
-        while self.intake.turn(0.0) or self.estimator.work(0.0):
+        while self.vehicle.turn(0.0):
             pass
 
     def answer_some(self) -> None:

@@ -59,16 +59,17 @@ from coec.service.api.reply_builders import SerializedReply
 from coec.service.api.rig_answers import RigAnswers
 from coec.service.api.routes import VehicleRoutes
 from coec.service.api.uplink import Heartbeats, Uplink
-from coec.service.camera_lidar_pair import Pair
+from coec.service.camera_lidar_pair import CameraLidarPair
 from coec.service.configuration import redacted_configuration
 from coec.service.cpu_budget import Budget
-from coec.service.engine.rig import RigEstimatorThread
-from coec.service.engine.vehicle import Call, Intake
-from coec.service.recording.recorder import RecordingPlan
+from coec.service.engine.rig import RigEstimator
+from coec.service.engine.vehicle import Vehicle
+from coec.service.recording.recorder import RecordingPlan, RecordingThread, WindowLost, WindowRecorded
 from coec.service.recording.snippets import SnippetRecorder
 from coec.service.recording.window_store import WindowStore
 from coec.service.records.pair_store import PairStore
 from coec.service.records.state_store import StateStore
+from coec.service.timing import Clock
 from coec.service.vehicle_context import VehicleContext
 from coec.service.worker.supervisor import Worker
 from coec.service.worker.worker_jobs import (
@@ -257,11 +258,11 @@ class InstantRecorder:
         plan: RecordingPlan,
         folder: WindowStore,
         losses: LossCounter,
-        on_recorded: Callable[[str, Path, bool], None],
-        on_lost: Callable[[str], None],
+        recording: RecordingThread,
+        post: Callable[[str, WindowRecorded | WindowLost], None],
         snippets: SnippetRecorder | None,
     ) -> None:
-        del losses, snippets
+        del losses, recording, snippets
         self.plan, self.configuration = plan, plan.configuration
         self.problem = None
         self.has_room = True
@@ -273,8 +274,7 @@ class InstantRecorder:
         self.between: dict[str, list[int]] = {}
         self.latest: Path | None = None
         self._folder = folder
-        self._on_recorded = on_recorded
-        self._on_lost = on_lost
+        self._post = post
         self._stamps: list[int] = []
 
     def follow(self, plan: RecordingPlan) -> None:
@@ -305,7 +305,7 @@ class InstantRecorder:
         assert len(stamps) == slice_end.pairs
         self.stamps[slice_end.window_id] = stamps
         if self.loses:
-            self._on_lost(slice_end.window_id)
+            self._post(self.plan.rig.pair, WindowLost(slice_end.window_id))
             return
         self.recorded += 1
         self.latest = self._folder.path(slice_end.window_id)
@@ -326,7 +326,8 @@ class InstantRecorder:
             self.worker.estimates[slice_end.window_id] = estimate_across_move(
                 self.worker.estimates[slice_end.window_id], stamps, late, self._seen
             )
-        self._on_recorded(slice_end.window_id, self.latest, True)
+        self._folder.hold(slice_end.window_id)
+        self._post(self.plan.rig.pair, WindowRecorded(slice_end.window_id, self.latest, True))
 
     def _seen(self, stamp_ns: int) -> Matrix4:
         """The pose at a stamp as far as windows see it."""
@@ -350,6 +351,15 @@ def estimate_across_move(of: Estimate, stamps: list[int], late: list[int], seen:
     return replace(
         of, verdict=verdict, moved=MovedWithin(last_before, late[0], len(late), seen(last_before), seen(late[0]))
     )
+
+
+class ShiftedClock(Clock):
+    """That of the machine, ahead by some seconds."""
+
+    ahead_s = 0.0
+
+    def monotonic_s(self) -> float:
+        return super().monotonic_s() + self.ahead_s
 
 
 class PairBench:
@@ -382,19 +392,20 @@ class PairBench:
         self.worker.pay = self.budget.pay
         self.worker.truth = self.truth
         store = StateStore(self.folder, self.config.vehicle)
-        self.intake = Intake(self.config.limits)
         self.published: list[str] = []
         self.shown: list[str] = []
         disk_writer = InstantDiskWriter(self.folder)
+        rig = RigEstimator(self.folder, (), disk_writer)
+        self.clock = ShiftedClock()
+        self.vehicle = Vehicle(self.config.limits, self.budget, rig, lambda _: None, clock=self.clock)
         self.context = VehicleContext(
             Keys("coec", self.config.vehicle),
-            self.intake,
+            self.vehicle,
             store,
             disk_writer,
             windows,
+            RecordingThread(),
             cast("Worker", self.worker),
-            self.budget,
-            RigEstimatorThread(self.folder, (), disk_writer),
             lambda key, _: self.published.append(key),
             lambda: (),
             lambda pair, _overlay, _pose: self.shown.append(pair.name),
@@ -402,7 +413,7 @@ class PairBench:
         )
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(runtime_pair, "Recorder", InstantRecorder)
-            self.pair = Pair(self.config.pairs[0], self.config, self.context)
+            self.pair = CameraLidarPair(self.config.pairs[0], self.config, self.context)
         self.recorder.worker = self.worker
         self.answers = self.pair.answers
 
@@ -420,25 +431,29 @@ class PairBench:
 
     def drive(self, begin_s: int, end_s: int, speed_mps: float = 5.0) -> None:
         for stamp_ns in range(begin_s * NS_PER_S, end_s * NS_PER_S, NS_PER_S // 2):
-            self.pair.stream.take([frame_pair_at(stamp_ns, speed_mps)])
+            self.hold(frame_pair_at(stamp_ns, speed_mps))
             self.settle()
         if isinstance(self.worker, SlowWorker):
             self.worker.work(share=1.0)
             self.settle()
 
     def settle(self) -> None:
-        """What the threads of the pair do until there is nothing more that they may do."""
-        going = True
-        while going:
-            going = False
-            while isinstance(item := self.intake.inbox.take(0.0), Call):
-                item.run()
-                going = True
-            going |= self.pair.stream.choose_next()
-            self.pair.stream.renew_report()
-            going |= self.pair.manager.work(0.0)
+        """What the engine does until there is nothing more that it may do."""
+        while self.vehicle.turn(0.0):
+            self.pair.stream.renew_report(self.pair.engine.selector.statistics)
         if isinstance(self.worker, SlowWorker):
             self.worker.work(share=0.05)
+
+    def hold(self, pair: FramePair) -> None:
+        """A frame pair has come."""
+        self.pair.stream.hold([pair], set_clock=True)
+
+    def check_clocks(self, ahead_s: float = 0.0) -> None:
+        """The clocks are evaluated as they will be in `ahead_s`."""
+        self.clock.ahead_s = ahead_s
+        self.pair.stream.renew_report(self.pair.engine.selector.statistics)
+        self.pair._tick()
+        self.clock.ahead_s = 0.0
 
     def do(self, name: str, **arguments: Any) -> str:
         return self.acknowledged(name, **arguments).code
@@ -540,15 +555,14 @@ def serving(
     bench = PairBench(folder, vehicle=VEHICLE, authority=authority)
     before(bench)
     bus = Bus(open_session(config, VEHICLE_LIMITS))
-    threads = (*bus.threads, bench.intake.thread, bench.pair.manager.thread)
+    threads = (*bus.threads, bench.vehicle.thread)
     for thread in threads:
         thread.start()
     try:
         yield serve(bench, config, bus)
     finally:
         bus.undeclare_inputs()
-        bench.intake.request_stop()
-        bench.pair.manager.request_stop()
+        bench.vehicle.request_stop()
         for thread in threads:
             thread.request_stop()
         assert all(thread.join(STOP_TIMEOUT_S) for thread in threads)

@@ -28,6 +28,7 @@ from coec.service.records.incidents import Incidents
 from coec.service.records.pair_store import PairStore
 from coec.service.records.rig_store import RigStore
 from coec.service.records.state_store import RestoredPair, StateStore, read_pairs
+from coec.service.timing import Clock
 from support.vehicles import InstantDiskWriter
 from upgrade.write_state import VEHICLE, checked, rules
 
@@ -79,6 +80,7 @@ class Vehicle:
             InstantDiskWriter(self.folder),
             WindowStore(self.folder / "windows", config),
             losses,
+            Clock(),
         )
         return store, losses
 

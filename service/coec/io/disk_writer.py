@@ -61,6 +61,7 @@ class DiskWriter:
         self._due: dict[Persistable, None] = {}
         self._registered: dict[Persistable, None] = {}
         self._report_replaced: list[Callable[[str], object]] = []
+        self._notify_written: list[Callable[[], object]] = []
         self._pin = _Pin.of(folder)
         self._requested = self._written = 0
         self._started_s: float | None = None
@@ -87,17 +88,21 @@ class DiskWriter:
         """Call `report` with one sentence on this thread, before the files are written into another folder."""
         self._report_replaced.append(report)
 
-    def has_written(self) -> bool:
-        """Whether everything noted before this call is on the disk. Waits at most `PATIENCE_S`, and not at all if the
+    def on_written(self, notify: Callable[[], object]) -> None:
+        """Call `notify` on this thread whenever files have been written."""
+        self._notify_written.append(notify)
+
+    def has_written(self, patience_s: float = PATIENCE_S) -> bool:
+        """Whether everything noted before this call is on the disk. Waits at most `patience_s`, and not at all if the
         disk refuses, or if the write under way has already taken that long."""
         with self._condition:
-            requested, end_s = self._requested, time.monotonic() + PATIENCE_S
+            requested, end_s = self._requested, time.monotonic() + patience_s
             while self._written < requested:
                 now_s = time.monotonic()
-                patience_s = min(end_s, (now_s if self._started_s is None else self._started_s) + PATIENCE_S) - now_s
-                if self._failure is not None or patience_s <= 0.0:
+                rest_s = min(end_s, (now_s if self._started_s is None else self._started_s) + patience_s) - now_s
+                if self._failure is not None or rest_s <= 0.0:
                     return False
-                self._condition.wait(patience_s)
+                self._condition.wait(rest_s)
             return True
 
     @property
@@ -134,6 +139,8 @@ class DiskWriter:
             else:
                 self._failure, self._written = None, number
             self._condition.notify_all()
+        for notify in self._notify_written:
+            notify()
 
     def _notice_replacement(self) -> None:
         """Make all files due if the folder is another one than before."""

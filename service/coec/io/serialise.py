@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.state import PairState
+from coec.calibration.state_machine import step_between
 from coec.calibration.types import (
     Decision,
     Estimate,
@@ -274,6 +275,29 @@ def check_of(observation: Observation, after: PairState) -> replies.CheckReply:
         evidence=after.monitor.evidence,
         state=after.health.value,
     )
+
+
+def candidate_of(state: PairState) -> replies.Candidate | None:
+    """The candidate that waits for `apply`; None if there is none."""
+    if state.pending is None:
+        return None
+    pending = state.pending
+    window_id = pending.estimate.window_id
+    content = f"{window_id}\n".encode() + pending.T_camera_lidar.astype("<f8").tobytes()
+    return replies.Candidate(
+        window_id=window_id,
+        sha256=hashlib.sha256(content).hexdigest(),
+        data_stamp_ns=pending.estimate.data_stamp_ns,
+        camera_from_lidar=transform_of(pending.T_camera_lidar),
+        step=degrees_and_metres(step_between(state.T_camera_lidar, pending.T_camera_lidar)),
+        waits=replies.Reason(code=pending.waits.code, text=pending.waits.text),
+    )
+
+
+def degrees_and_metres(rad_m: NDArray[np.float64]) -> replies.Vector6:
+    """(6,) radians and metres in the units of the wire, degrees and metres."""
+    a, b, c, x, y, z = (float(value) for value in rad_m)
+    return math.degrees(a), math.degrees(b), math.degrees(c), x, y, z
 
 
 def _limit_of(metric: replies.MetricReply) -> float:

@@ -1,128 +1,261 @@
-"""One camera-LiDAR pair: its parts, and how it starts and ends. No logic.
-
-Three threads work for a pair, and each is the only writer of its part:
-
-- the intake's thread, which all pairs of a vehicle share, owns samples, pairs of frames, and what each is used for,
-- the recorder's thread owns files,
-- the decider's thread owns answers, commands and ages.
-
-The threads reach each other through the inbox (intake), the recorder's queue and the mailbox (decider). The worker's
-results come back through the mailbox, too.
+"""One camera-LiDAR pair of the service: its streams, its state machine, and everything outside to which the actions of
+the state machine go.
 """
 
 import logging
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 
+from coec.calibration.frames.window import SliceClosed
 from coec.config import CalibrationConfig, Config, PairConfig
 from coec.io.logs import LossCounter
+from coec.io.msgpack_frames import encode_camera
 from coec.io.rig_files import rig_of
 from coec.service.api.command_execution import Commands
 from coec.service.api.pair_answers import PairAnswers
 from coec.service.configuration import settings_hash
+from coec.service.engine.commands import CommandExecutor, PairCommand, Surroundings
 from coec.service.engine.frame_selector import FrameSelector
-from coec.service.engine.job_client import IncidentPictures, JobClient
-from coec.service.engine.pair import CalibrationManager
+from coec.service.engine.messages import (
+    Action,
+    CommissioningSubject,
+    Event,
+    JobDone,
+    KeepSnippet,
+    PairSchedule,
+    Prefetch,
+    Publish,
+    Reconfigured,
+    RecordBetween,
+    RecordPair,
+    SensorTime,
+    SubmitCheck,
+    SubmitCommissioning,
+    SubmitPicture,
+    SubmitSolve,
+    Tick,
+    UseCalibration,
+    WindowSubject,
+)
+from coec.service.engine.pair import Pair
 from coec.service.engine.pair_stream import PairStream
-from coec.service.engine.schedule import ResultSchedule
+from coec.service.engine.schedule import Request, Schedule
+from coec.service.ingest.decoder import Frame
 from coec.service.ingest.frame_buffers import FrameRing
-from coec.service.recording.recorder import Recorder, RecordingPlan
+from coec.service.ingest.sensor_stream import SensorStream
+from coec.service.recording.recorder import Recorder, RecordingPlan, WindowRecorded
 from coec.service.recording.snippets import SnippetRecorder
 from coec.service.records.pair_store import PairStore
 from coec.service.records.rig_store import RigBaseline
-from coec.service.task_queue import TaskQueue
 from coec.service.vehicle_context import VehicleContext
+from coec.service.worker import worker_jobs
 
 _log = logging.getLogger(__name__)
 
 
-class Pair:
-    """One pair. `stream` runs on the intake's thread, `recorder` and `decider` each on their own. Any thread may use
-    `answers` and `commands`."""
+class CameraLidarPair:
+    """One pair. `answers`, `commands` and `reconfigure` are for any thread; everything else belongs to the thread of
+    the engine."""
 
     def __init__(self, pair: PairConfig, config: Config, context: VehicleContext) -> None:
-        """Builds the pair and recalls its state from the disk.
+        """Builds the pair, restores its state from the disk, and has it join the engine.
 
         Raises:
             ConfigError: the rig cannot be built.
         """
+        vehicle, folder, clock = context.vehicle, context.folder, context.vehicle.clock
         self.name = pair.name
-        rig, folder = rig_of(pair), context.folder
-        losses = LossCounter(_log, pair.name)
-        task_queue, queue = TaskQueue(), ResultSchedule(lambda: context.worker.compiled_s)
-        store = PairStore(rig, config.vehicle, config.state, context.store, context.disk_writer, folder, losses)
-        of_rig = context.rig.join(pair, rig.T_camera_lidar_nominal, store.state, lambda: queue.unanswered == 0)
-        job_client = JobClient(pair, queue, context.worker, context.budget, task_queue, folder, of_rig, context.show)
+        self._pair, self._context = pair, context
+        rig, losses = rig_of(pair), LossCounter(_log, pair.name)
+        store = PairStore(rig, config.vehicle, config.state, context.store, context.disk_writer, folder, losses, clock)
         baseline = RigBaseline(pair, rig, config.state)
         context.disk_writer.register(baseline)
-        self._rig, self._vehicle, self._packed = rig, config.vehicle, config.state.packing == "lz4"
-        plan = self._plan(pair, baseline.calibration)
-        snippets = self._snippets_of(plan, context, losses)
-        self.recorder = Recorder(plan, folder, losses, job_client.solve, job_client.lost, snippets)
-        first_slice_s = context.budget.join(pair.name, pair.monitor, pair.window)
+        member = vehicle.rig.join(pair, rig.T_camera_lidar_nominal, store.state)
+        schedule: PairSchedule = Schedule()
+        first_slice_s = vehicle.budget.join(pair.name, pair.monitor, pair.window)
         selector = FrameSelector(
-            pair, config.limits, rig, store.served, job_client, self.recorder, losses, first_slice_s, store.carried_over
-        )
-        ring = None if snippets is None else FrameRing(config.snippets, _ring_bytes(config), snippets.submit)
-        self.stream = PairStream(pair, config, context.intake, selector, lambda: self.recorder.has_room, losses, ring)
-        self.answers = PairAnswers(
-            pair, config, rig, store, folder, self.recorder, self.stream, context, lambda: self.commands.counts
-        )
-        pictures = IncidentPictures(store.add_picture, folder, job_client, losses)
-        self.manager = CalibrationManager(
             pair,
-            config.stale_after_s,
-            store,
-            baseline,
-            queue,
-            pictures,
-            self.stream,
-            of_rig,
-            task_queue,
-            losses,
-            self.recorder.reconfigure,
-            self.answers.on_update,
-        )
-        job_client.connect(self.manager)
-        self.commands = Commands(
-            pair,
-            config.vehicle,
+            config.limits,
             rig,
-            self.manager,
-            task_queue,
-            store,
-            self.stream,
-            selector,
-            self.recorder,
-            folder,
-            job_client,
+            store.served,
+            schedule,
+            vehicle.budget,
+            member,
+            losses,
+            first_slice_s,
+            store.carried_over,
         )
-        self._selector, self._job_client, self._task_queue = selector, job_client, task_queue
-        self.manager.publish()
+        self.engine = Pair(pair, config.stale_after_s, store, baseline, schedule, selector, member, losses, clock)
+        self._executor = CommandExecutor(pair, config.vehicle, rig, self.engine, folder, clock)
+        self._rig, self._packed, self._metadata = rig, config.state.packing == "lz4", {"vehicle": config.vehicle}
+        plan = self._plan(pair, baseline.calibration)
+        snippets = None
+        if context.snippets is not None:
+            snippets = SnippetRecorder(plan.rig, plan.metadata, context.snippets, losses, packed=plan.packed)
+        self.recorder = Recorder(plan, folder, losses, context.recording, vehicle.inbox.post, snippets)
+        ring = None if snippets is None else FrameRing(config.snippets, _ring_bytes(config), snippets.submit)
+        self.stream = PairStream(pair, config, vehicle, losses, ring)
+        self.commands = Commands(pair.name, config.vehicle, store, vehicle.inbox)
+        self.answers = PairAnswers(
+            pair, config, rig, store, folder, self.recorder, self.stream, context, self.commands.counted
+        )
+        self.engine.publish()
+        self._do(self.engine.take_actions())
+        vehicle.join(self)
 
     def reconfigure(self, pair: PairConfig, stale_after_s: float, history_text: str) -> None:
-        """Goes on with other settings, which differ only in what `reload.RELOADED` names. `told` is the entry for the
-        history. Called on the main thread; each part takes over its settings on the thread that owns them."""
-        self._job_client.reconfigure(pair)
+        """Goes on with other settings, which differ only in what `configuration.RELOADED` names. `history_text` is the
+        entry for the history."""
         self.answers.reconfigure(pair)
-        self.commands.reconfigure(pair)
         self.recorder.follow(self._plan(pair, pair.calibration))
-        self.stream.call(lambda: self._selector.reconfigure(pair.window))
-        self._task_queue.post(lambda: self.manager.reconfigure(pair, stale_after_s, history_text))
+        self._context.vehicle.inbox.post(self.name, Reconfigured(pair, stale_after_s, history_text))
 
     def _plan(self, pair: PairConfig, calibration: CalibrationConfig) -> RecordingPlan:
-        metadata = {"vehicle": self._vehicle, "pair": pair.name, "settings_hash": settings_hash(pair)}
+        metadata = {**self._metadata, "pair": pair.name, "settings_hash": settings_hash(pair)}
         return RecordingPlan(self._rig, calibration, pair.window.min_pairs, metadata, self._packed)
 
-    @staticmethod
-    def _snippets_of(plan: RecordingPlan, context: VehicleContext, losses: LossCounter) -> SnippetRecorder | None:
-        if context.snippets is None:
-            return None
-        return SnippetRecorder(plan.rig, plan.metadata, context.snippets, losses, packed=plan.packed)
+    # --- on the thread of the engine: see `Receiver` ----------------------------------------------------------------
+
+    @property
+    def sensors(self) -> Mapping[str, SensorStream]:
+        """The streams, by kind."""
+        return self.stream.sensors
+
+    @property
+    def unanswered(self) -> int:
+        """Number of checks and windows without a result."""
+        return self.engine.unanswered
+
+    def taker(self, name: str) -> Callable[[Frame], None]:
+        """The function that takes the frames of a stream; each frame says of which it is."""
+        del name
+        return self.stream.push
+
+    def on_event(self, event: Event | PairCommand) -> object:
+        """Takes an event; returns the acknowledgement of a command."""
+        if isinstance(event, PairCommand):
+            if event.name == "calibrate":
+                self.finish_pairs()
+            around = Surroundings(self.recorder.latest, self._context.worker.commissioning(self.name))
+            acknowledgement, actions = self._executor.execute(event, around)
+            self._do(actions)
+            return acknowledgement
+        if isinstance(event, JobDone):
+            self._release(event)
+        elif isinstance(event, Reconfigured):
+            self._pair = event.pair
+            self._executor.reconfigure(event.pair)
+        self._do(self.engine.step(event))
+        if isinstance(event, WindowRecorded):
+            self._context.folder.release(event.window_id)  # which its job holds by now
+        return None
+
+    def advance(self) -> bool:
+        """Evaluates the oldest frame pair if it may be evaluated: every result that counts before it has come and the
+        recorder has room; or it has waited too long, or too many frames wait. Returns whether it did."""
+        now_s = self._context.vehicle.clock.monotonic_s()
+        if self.engine.needs_tick(now_s):
+            self._tick()
+        if not self.stream.held:
+            return False
+        self.engine.warms_up = self._context.worker.warms_up
+        stamp_ns = self.stream.held.next_ns
+        if self.recorder.has_room:
+            self._do(self.engine.step(SensorTime(stamp_ns)))
+            if not self.engine.waits(stamp_ns):
+                self.stream.held.stop_waiting()
+                self._do(self.engine.step(self.stream.take()))
+                return True
+        if not self.stream.held.has_waited(now_s):
+            return False
+        self._do(self.engine.step(self.stream.take()))
+        return True
+
+    def tick(self, *, waiting: bool) -> None:
+        """Time has passed; `waiting`: samples of the streams are in the inbox. Ends a slice in silence."""
+        self.stream.tick(self.engine.selector.statistics, waiting=waiting)
+        end_ns = self.engine.selector.slice_end_ns
+        if end_ns is not None and self.stream.silence_ends(end_ns):
+            self.stream.end_in_silence(end_ns, self.engine.selector.statistics.last_ns)
+            if not self.stream.held:
+                self._do(self.engine.step(SensorTime(end_ns)))
+
+    def _tick(self) -> None:
+        self._do(self.engine.step(Tick(self._context.worker.compiled_s, self.stream.report)))
+
+    def finish_pairs(self) -> None:
+        """Evaluates every frame pair that has come, even if it should wait for a result."""
+        self.stream.flush()
+        while self.stream.held:
+            self._do(self.engine.step(self.stream.take()))
 
     def finish_window(self) -> None:
-        """Ends the open window when the service ends; called after the intake's thread has ended."""
+        """Ends the open window when the service ends; called after the thread of the engine has ended."""
         self.stream.finish_snippet()
-        self.stream.finish_pairs()
-        self._selector.finish()
+        self.finish_pairs()
+        closed = self.engine.selector.finish()
+        self._do([] if closed is None else [closed])
+
+    # --- actions ----------------------------------------------------------------------------------------------------
+
+    def _do(self, actions: Iterable[Action]) -> None:
+        for action in actions:
+            match action:
+                case RecordPair():
+                    self.recorder.add(action.window_id, action.pair, action.T_camera_lidar)
+                case RecordBetween():
+                    self.recorder.add_between(action.window_id, action.pair)
+                case SliceClosed():
+                    self.recorder.end(action)
+                case UseCalibration():
+                    self.recorder.reconfigure(action.calibration)
+                case KeepSnippet():
+                    self.stream.keep_snippet(action.event, action.T_camera_lidar)
+                case Publish():
+                    self.answers.on_update(action.snapshot)
+                case Prefetch():
+                    self._context.worker.prefetch(self.name, encode_camera(action.camera))
+                case _:
+                    self._context.worker.submit(self._job(action))
+                    if isinstance(action, SubmitCheck):
+                        self._context.show(self._pair, action.pairs[-1], action.served.T_camera_lidar)
+
+    def _job(self, action: SubmitCheck | SubmitSolve | SubmitPicture | SubmitCommissioning) -> worker_jobs.WorkerJob:
+        """The job of an action, whose outcome comes back as `JobDone` with the same subject. Windows stay on the disk
+        until it has ended."""
+        subject = action.request if isinstance(action, SubmitCheck) else action.subject
+        done = partial(self._context.vehicle.post_outcome, self.name, subject)
+        folder = self._context.folder
+        match action:
+            case SubmitCheck():
+                return worker_jobs.check(
+                    self.name, action.calibration, action.served.T_camera_lidar, action.pairs, done
+                )
+            case SubmitSolve():
+                folder.hold(action.subject.window_id)
+                return worker_jobs.solve(self.name, action.path, action.subject.window_id, done, action.subject.live)
+            case SubmitCommissioning():
+                for window_id in action.subject.window_ids:
+                    folder.hold(window_id)
+                paths = [folder.path(window_id) for window_id in action.subject.window_ids]
+                return worker_jobs.commission(self.name, action.calibration, action.pose, paths, done)
+            case SubmitPicture():
+                path = folder.path(action.window_id)
+                if len(action.poses) == 1:
+                    return worker_jobs.overlay(self.name, path, action.poses[0], action.captions[0], done)
+                (first, second), (one, other) = action.poses, action.captions
+                return worker_jobs.comparison(self.name, path, (first, second), (one, other), done)
+
+    def _release(self, event: JobDone) -> None:
+        """A job has ended: gives back what was reserved for it."""
+        match event.subject:
+            case WindowSubject():
+                self._context.folder.release(event.subject.window_id)
+            case CommissioningSubject():
+                for window_id in event.subject.window_ids:
+                    self._context.folder.release(window_id)
+            case Request():
+                self._context.vehicle.budget.release(self.name)
 
 
 def _ring_bytes(config: Config) -> int:

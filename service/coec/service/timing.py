@@ -6,6 +6,7 @@ spends ten times as much per second, and makes the same checks as the drive did,
 """
 
 import threading
+import time
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Sequence
@@ -13,6 +14,19 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 NS_PER_S = 1_000_000_000
+
+
+class Clock:
+    """The clocks of this machine. A replay gives others."""
+
+    def monotonic_s(self) -> float:
+        """A steady clock, s."""
+        return time.monotonic()
+
+    def wall_ns(self) -> int:
+        """The clock on the wall, ns since 1970."""
+        return time.time_ns()
+
 
 OBSERVATIONS = 32
 """Number of pairs from which the ratio of sensor time to wall time is taken: three seconds at 10 Hz."""

@@ -9,10 +9,9 @@ from coec.io.disk_writer import DiskWriter
 from coec.io.zenoh.bus import Answer
 from coec.io.zenoh.ros_node import RosTopicList
 from coec.schemas.keys import Keys
-from coec.service.cpu_budget import Budget
 from coec.service.discovery_listener import NominalStatus
-from coec.service.engine.rig import RigEstimatorThread
-from coec.service.engine.vehicle import Intake
+from coec.service.engine.vehicle import Vehicle
+from coec.service.recording.recorder import RecordingThread
 from coec.service.recording.snippets import SnippetStore
 from coec.service.recording.window_store import WindowStore
 from coec.service.records.state_store import StateStore
@@ -36,7 +35,7 @@ class VehicleContext:
     """Everything that a pair shares with the others. The callables may be called from any thread.
 
     Attributes:
-        intake: takes the samples of all pairs.
+        vehicle: the engine, which all pairs join.
         show: `show(pair, drawn, pose)` reports a pair of frames that is being checked at an extrinsic (4, 4).
         topics: the topics that the vehicle's ROS publishes now.
         nominal: where the nominal calibration of a pair, given by name, comes from.
@@ -45,13 +44,12 @@ class VehicleContext:
     """
 
     keys: Keys
-    intake: Intake
+    vehicle: Vehicle
     store: StateStore
     disk_writer: DiskWriter
     folder: WindowStore
+    recording: RecordingThread
     worker: Worker
-    budget: Budget
-    rig: RigEstimatorThread
     publish: Callable[[str, Answer], None]
     vehicle_problems: Callable[[], tuple[Reason, ...]]
     show: Callable[[PairConfig, FramePair, Matrix4], None]

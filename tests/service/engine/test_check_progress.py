@@ -8,8 +8,7 @@ import pytest
 
 from coec.calibration.types import Reason
 from coec.service.engine.check_progress import Attempts, CheckProgress
-from coec.service.engine.frame_selector import SelectionStatistics
-from coec.service.engine.pair_stream import StreamStatistics
+from coec.service.engine.messages import SelectionStatistics, StreamStatistics
 from coec.service.ingest.decoder import CAMERA, LIDAR, StreamCounts
 
 S = 1_000_000_000

@@ -96,10 +96,10 @@ def test_pairs_wait_for_what_counts_by_their_time(tmp_path: Path) -> None:
     bench.drive(0.0, 16.0)
     assert len(bench.worker.waiting) == 3
     bench.drive(16.0, 36.0)
-    assert bench.pairs[0].must_wait(36 * NS, for_own=False)
+    assert bench.pairs[0].waits(36 * NS)
     bench.slow = 1.0
     bench.settle()
-    assert not bench.pairs[0].must_wait(36 * NS, for_own=False)
+    assert not bench.pairs[0].waits(36 * NS)
 
 
 @pytest.mark.fault("the worker answers no registration", "a bounded number of sweeps is kept, the rest is counted")
@@ -107,7 +107,7 @@ def test_what_waits_is_bounded_and_losses_are_counted(tmp_path: Path) -> None:
     bench = LidarBench(tmp_path, slow=0.0, lidars=("roof", "bumper"))
     bench.drive(0.0, 130.0)
     assert len(bench.worker.waiting) <= 2
-    (stream,) = bench.intake._pairs
+    (stream,) = bench.vehicle._receivers.values()
     assert isinstance(stream, LidarPairStream)
     assert len(stream._sweep_sets) <= SWEEP_SETS_WAITING
     bench.slow = 1.0

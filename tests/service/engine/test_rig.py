@@ -1,4 +1,4 @@
-"""The rig's thread: what is put together is told to the pairs at one sensor time, kept, and the same every time."""
+"""The rig: what is put together is told to the pairs at one sensor time, kept, and the same every time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from coec.schemas.message import from_json, to_json
 from coec.schemas.rig_state import RigReply
 from coec.service.api.problems import INCONSISTENT, rig_problems
 from coec.service.api.rig_answers import RigAnswers, reply_of
-from coec.service.engine.rig import LAG_NS, QUIET_TICKS
+from coec.service.engine.rig import LAG_NS, QUIET_TICKS, RigSnapshot
 from coec.service.records.rig_store import RIG_FILE, RigStore
 from support.rigs import (
     CAMERAS,
@@ -311,11 +311,23 @@ def test_the_clock_of_the_sensors_steps_back_and_the_drive_goes_on(tmp_path: Pat
     assert reported.known.losses == {"time_stepped_back": 3}
 
 
+class Publishing(list[RigSnapshot]):
+    """Publishes what is appended."""
+
+    def __init__(self, publish: Callable[[RigSnapshot], None]) -> None:
+        super().__init__()
+        self._publish = publish
+
+    def append(self, snapshot: RigSnapshot) -> None:
+        super().append(snapshot)
+        self._publish(snapshot)
+
+
 def test_the_reply_survives_the_wire_and_is_published_on_change(tmp_path: Path) -> None:
     published: list[str] = []
     answers = RigAnswers(Keys("coec", "vehicle"), lambda key, _: published.append(key))
     reported = RigEstimatorBench(tmp_path)
-    reported.estimator.connect(answers.on_update, lambda: None)
+    reported.states = Publishing(answers.on_update)
     drive(reported, 20.0)
     assert set(published) == {"coec/@v1/vehicle/rig"}
     count = len(published)
@@ -347,8 +359,11 @@ def test_once_all_streams_have_stopped_nothing_waits_any_more(tmp_path: Path) ->
         reported.put(camera, 15.0, pair_check(camera, POSES, 10.0, np.zeros(6)))
     reported.settle()
     assert reply(reported).looks == {}
-    taken = [reported.estimator.work(0.001) for _ in range(QUIET_TICKS + 2)]
-    assert taken == [False] * (QUIET_TICKS - 1) + [True] * 3
+    for _ in range(QUIET_TICKS):
+        assert not reported.estimator.is_quiet
+        reported.estimator.tick()
+    assert reported.estimator.is_quiet
+    reported.settle()
     assert reply(reported).looks == {"front-roof": 1, "left-roof": 1, "rear-roof": 1}
 
 
@@ -357,9 +372,7 @@ def test_a_pair_that_joins_later_finds_what_the_first_has_come_to(tmp_path: Path
     reported.put("front", 5.0, pair_window("front", POSES, 1.0))
     reported.put("front", 5.0, served_extrinsic("front", POSES, 1.0))
     reported.settle()
-    reported.pairs["left"] = reported.estimator.join(
-        pair_config("left"), pair_pose("left", POSES), pair_state("left"), lambda: True
-    )
+    reported.pairs["left"] = reported.estimator.join(pair_config("left"), pair_pose("left", POSES), pair_state("left"))
     reported.settle()
     rig = reported.known.rig
     assert rig is not None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import logging
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,15 +15,22 @@ import numpy as np
 import pytest
 
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, FramePair, ImageFormat, LidarFrame
-from coec.config import Config, KnownStreamConfig
+from coec.config import Config, KnownStreamConfig, PairConfig
+from coec.io.disk_writer import DiskWriter
 from coec.io.logs import LossCounter
 from coec.io.msgpack_frames import encode_camera, encode_ego, encode_lidar
 from coec.io.zenoh.bus import InputSample
-from coec.service.engine import pair_stream
-from coec.service.engine.frame_selector import FrameSelector, SelectionStatistics
+from coec.service.camera_lidar_pair import CameraLidarPair
+from coec.service.cpu_budget import Budget
+from coec.service.engine.messages import Action, Event, SelectionStatistics, SensorTime
+from coec.service.engine.pair import Pair
 from coec.service.engine.pair_stream import PairStream
-from coec.service.engine.vehicle import FRAMES_WAITING, Intake, read_alike
+from coec.service.engine.rig import RigEstimator
+from coec.service.engine.vehicle import Vehicle
 from coec.service.ingest.decoder import CAMERA, EGO, LIDAR
+from coec.service.ingest.sensor_stream import FRAMES_WAITING, read_alike
+from coec.service.recording.recorder import Recorder
+from coec.service.vehicle_context import VehicleContext
 from support.vehicles import HEIGHT, WIDTH, pair_configuration
 
 HZ10_NS = 100_000_000
@@ -49,49 +57,76 @@ def rig_of(cameras: int, lidars: int, **limits: int) -> Config:
 
 @dataclass
 class Observations:
-    """In place of the chooser: what it was given, and when it ended a slice."""
+    """In place of the state machine of a pair: the frame pairs that it was given, and when its slice was ended."""
 
     statistics: SelectionStatistics = field(default_factory=SelectionStatistics)
     slice_end_ns: int | None = None
     pairs: list[FramePair] = field(default_factory=list)
     finished: list[int] = field(default_factory=list)
-    waits: bool = False
+    is_waiting: bool = False
     keeps: bool = True
+    unanswered: int = 0
+    warms_up: bool = False
 
-    def must_wait(self, stamp_ns: int) -> bool:
+    @property
+    def selector(self) -> Observations:
+        return self
+
+    def needs_tick(self, monotonic_s: float) -> bool:
+        del monotonic_s
+        return False
+
+    def waits(self, stamp_ns: int) -> bool:
         del stamp_ns
-        return self.waits
+        return self.is_waiting
 
-    def choose(self, pair: FramePair) -> None:
-        self.statistics = replace(self.statistics, last_ns=pair.stamp_ns)
-        if self.keeps:
-            self.pairs.append(pair)
+    def step(self, event: Event) -> list[Action]:
+        if isinstance(event, FramePair):
+            self.statistics = replace(self.statistics, last_ns=event.stamp_ns)
+            if self.keeps:
+                self.pairs.append(event)
+        elif isinstance(event, SensorTime) and event.stamp_ns == self.slice_end_ns:
+            self.finished.append(event.stamp_ns)
+            self.slice_end_ns = None
+        return []
 
-    def end_slice_by(self, now_ns: int) -> bool:
-        self.finished.append(now_ns)
-        self.slice_end_ns = None
-        return True
+
+class ObservedPair(CameraLidarPair):
+    """A pair of the service, before `Observations`."""
+
+    def __init__(self, pair: PairConfig, config: Config, engine: Vehicle, observations: Observations) -> None:
+        self.name = pair.name
+        self.stream = PairStream(pair, config, engine, LossCounter(logging.getLogger("test"), pair.name))
+        self.engine = cast("Pair", observations)
+        self.recorder = cast("Recorder", SimpleNamespace(has_room=True))
+        worker = SimpleNamespace(warms_up=False)
+        self._context = cast("VehicleContext", SimpleNamespace(vehicle=engine, worker=worker))
+        engine.join(self)
 
 
-class Vehicle:
-    """An intake without a thread, and what its pairs come to."""
+class VehicleBench:
+    """An engine without a thread, and what its pairs come to."""
 
     def __init__(self, config: Config) -> None:
         self.config = config
-        self.intake = Intake(config.limits)
+        disk_writer = DiskWriter(Path("state"))
+        rig = RigEstimator(Path("state"), (), disk_writer)
+        self.engine = Vehicle(config.limits, Budget(config.budget, lambda: 0.0), rig, lambda _: None)
         self.observations: dict[str, Observations] = {}
-        self.streams: dict[str, PairStream] = {}
+        self.pairs: dict[str, ObservedPair] = {}
         for pair in config.pairs:
             self.join(pair.name)
         self.received: dict[str, Callable[[InputSample], None]] = {}
         self.listen()
 
+    @property
+    def streams(self) -> dict[str, PairStream]:
+        return {name: pair.stream for name, pair in self.pairs.items()}
+
     def join(self, name: str) -> None:
         (pair,) = [one for one in self.config.pairs if one.name == name]
         self.observations[name] = Observations()
-        losses = LossCounter(logging.getLogger("test"), name)
-        selector = cast("FrameSelector", self.observations[name])
-        self.streams[name] = PairStream(pair, self.config, self.intake, selector, lambda: True, losses)
+        self.pairs[name] = ObservedPair(pair, self.config, self.engine, self.observations[name])
 
     def listen(self) -> list[str]:
         subscribed: list[str] = []
@@ -100,7 +135,7 @@ class Vehicle:
             subscribed.append(stream.place)
             self.received[stream.place] = take
 
-        self.intake.listen(subscribe)
+        self.engine.listen(subscribe)
         return subscribed
 
     def put(self, key: str, frame: CameraFrame | LidarFrame | EgoMotion | bytes) -> None:
@@ -116,10 +151,10 @@ class Vehicle:
         self.received[key](InputSample(payload, ENCODING))
 
     def settle(self) -> None:
-        while self.intake.turn(0.0):
+        while self.engine.turn(0.0):
             pass
-        for stream in self.streams.values():
-            stream.renew_report()
+        for pair in self.pairs.values():
+            pair.stream.renew_report(pair.engine.selector.statistics)
 
     def drive(self, numbers: Sequence[int], cameras: int, lidars: int) -> None:
         for number in numbers:
@@ -142,13 +177,13 @@ def sweep(number: int, points: int = 2) -> LidarFrame:
 
 
 def test_a_stream_is_listened_to_once_however_many_pairs_it_is_of() -> None:
-    vehicle = Vehicle(rig_of(cameras=8, lidars=3))
+    vehicle = VehicleBench(rig_of(cameras=8, lidars=3))
     assert sorted(vehicle.received) == sorted([*(f"camera/{i}" for i in range(8)), *(f"lidar/{i}" for i in range(3))])
     assert vehicle.listen() == [], "once"
 
 
 def test_every_pair_gets_the_same_frame_and_it_is_counted_once() -> None:
-    vehicle = Vehicle(rig_of(cameras=2, lidars=2))
+    vehicle = VehicleBench(rig_of(cameras=2, lidars=2))
     vehicle.drive(range(6), 2, 2)
     pairs = {name: observations.pairs for name, observations in vehicle.observations.items()}
     assert [len(each) for each in pairs.values()] == [5, 5, 5, 5], "the last may have a nearer partner still"
@@ -157,14 +192,14 @@ def test_every_pair_gets_the_same_frame_and_it_is_counted_once() -> None:
         assert one.camera is not other.camera
     for one, other in zip(pairs["0-0"], pairs["0-1"], strict=True):
         assert one.camera is other.camera
-    for sensor in vehicle.intake.sensors:
+    for sensor in vehicle.engine.sensors:
         assert (sensor.decoder.counts().received, sensor.decoder.counts().accepted) == (6, 6)
     assert [stream.report.streams[LIDAR].accepted for stream in vehicle.streams.values()] == [6] * 4
 
 
 def test_a_pair_of_a_rig_is_given_what_it_would_be_given_alone() -> None:
     rng = np.random.default_rng(1)
-    together, alone = Vehicle(rig_of(2, 1)), Vehicle(rig_of(1, 1))
+    together, alone = VehicleBench(rig_of(2, 1)), VehicleBench(rig_of(1, 1))
     waiting: dict[str, list[CameraFrame | LidarFrame]] = {
         "camera/0": [image(number) for number in range(40) if number % 7],
         "camera/1": [image(number, 1) for number in range(40) if number % 5],
@@ -181,9 +216,9 @@ def test_a_pair_of_a_rig_is_given_what_it_would_be_given_alone() -> None:
             alone.settle()
     for vehicle in (together, alone):
         vehicle.settle()
-        vehicle.streams["0-0"].finish_pairs()
+        vehicle.pairs["0-0"].finish_pairs()
 
-    def reported(vehicle: Vehicle) -> list[tuple[int, int]]:
+    def reported(vehicle: VehicleBench) -> list[tuple[int, int]]:
         return [(pair.camera.stamp_ns, pair.lidar.stamp_ns) for pair in vehicle.observations["0-0"].pairs]
 
     assert reported(together) == reported(alone)
@@ -192,7 +227,7 @@ def test_a_pair_of_a_rig_is_given_what_it_would_be_given_alone() -> None:
 
 
 def test_what_is_lost_of_a_stream_is_counted_once_and_every_pair_of_it_reports() -> None:
-    vehicle = Vehicle(rig_of(2, 1))
+    vehicle = VehicleBench(rig_of(2, 1))
     vehicle.put("lidar/0", b"rubbish")
     vehicle.put("camera/0", image(0, sequence=0))
     vehicle.put("camera/0", image(20, sequence=20))
@@ -220,13 +255,13 @@ def test_two_lidars_in_one_cloud_are_two_streams_of_one_key() -> None:
         pair.model_copy(update={"lidar": pair.lidar.model_copy(update={"key": "lidar/0", "source": number})})
         for number, pair in enumerate(config.pairs)
     ]
-    vehicle = Vehicle(config.model_copy(update={"pairs": tuple(pairs)}))
-    assert [sensor.kind for sensor in vehicle.intake.sensors] == [CAMERA, LIDAR, LIDAR]
+    vehicle = VehicleBench(config.model_copy(update={"pairs": tuple(pairs)}))
+    assert [sensor.kind for sensor in vehicle.engine.sensors] == [CAMERA, LIDAR, LIDAR]
 
 
 def test_a_pair_that_joins_later_gets_what_comes_then() -> None:
     config = rig_of(2, 1)
-    vehicle = Vehicle(config.model_copy(update={"pairs": config.pairs[:1]}))
+    vehicle = VehicleBench(config.model_copy(update={"pairs": config.pairs[:1]}))
     vehicle.drive(range(5), 1, 1)
     vehicle.config = config
     vehicle.join("1-0")
@@ -238,21 +273,21 @@ def test_a_pair_that_joins_later_gets_what_comes_then() -> None:
 
 @pytest.mark.fault("a pair whose answers are late", "the other pairs of the vehicle are looked at meanwhile")
 def test_a_pair_that_waits_keeps_no_other_waiting(record_property: Callable[[str, object], None]) -> None:
-    vehicle = Vehicle(rig_of(2, 1))
-    vehicle.observations["0-0"].waits = True
+    vehicle = VehicleBench(rig_of(2, 1))
+    vehicle.observations["0-0"].is_waiting = True
     vehicle.drive(range(30), 2, 1)
     reported = [len(observations.pairs) for observations in vehicle.observations.values()]
     record_property("figure", f"{reported[1]} of 29 pairs of the other")
     assert reported == [0, 29]
     assert vehicle.streams["0-0"].report.held == 29
-    vehicle.observations["0-0"].waits = False
+    vehicle.observations["0-0"].is_waiting = False
     vehicle.settle()
     assert len(vehicle.observations["0-0"].pairs) == 29
 
 
 @pytest.mark.fault("a sensor that floods one stream", "other streams of the vehicle lose nothing")
 def test_each_stream_has_room_of_its_own(record_property: Callable[[str, object], None]) -> None:
-    vehicle = Vehicle(rig_of(2, 1))
+    vehicle = VehicleBench(rig_of(2, 1))
     vehicle.settle()
     for number in range(10):
         vehicle.put("camera/1", image(number, 1))
@@ -262,7 +297,7 @@ def test_each_stream_has_room_of_its_own(record_property: Callable[[str, object]
     vehicle.settle()
     lost = {
         (sensor.config.place, *cause): count
-        for sensor in vehicle.intake.sensors
+        for sensor in vehicle.engine.sensors
         for cause, count in sensor.losses.snapshot().items()
     }
     record_property("figure", f"{sum(lost.values())} of 500 samples of the flood, none of others")
@@ -274,7 +309,7 @@ def test_each_stream_has_room_of_its_own(record_property: Callable[[str, object]
 def test_frames_of_all_pairs_are_bounded_together_and_each_counts_once(
     record_property: Callable[[str, object], None],
 ) -> None:
-    vehicle = Vehicle(rig_of(4, 1, max_held_bytes=MB))
+    vehicle = VehicleBench(rig_of(4, 1, max_held_bytes=MB))
     points = 8192  # 96 kB
     for number in range(40):
         vehicle.put("lidar/0", sweep(number, points))
@@ -288,7 +323,7 @@ def test_frames_of_all_pairs_are_bounded_together_and_each_counts_once(
     }
     record_property("figure", f"{sum(held.values()) / MB:.2f} MiB of 1.5 in sweeps")
     assert 1.2 * MB < sum(held.values()) <= 1.5 * MB
-    (lidar,) = [sensor for sensor in vehicle.intake.sensors if sensor.kind == LIDAR]
+    (lidar,) = [sensor for sensor in vehicle.engine.sensors if sensor.kind == LIDAR]
     assert lidar.losses.snapshot()[LIDAR, "memory_full"] > 0
     held.clear()
     for observations in vehicle.observations.values():
@@ -303,8 +338,8 @@ def test_frames_of_all_pairs_are_bounded_together_and_each_counts_once(
 
 @pytest.mark.fault("checks pile up before a worker that does not answer", "pairs wait no more; no frame is refused")
 def test_pairs_wait_no_more_before_frames_are_refused(record_property: Callable[[str, object], None]) -> None:
-    vehicle = Vehicle(rig_of(2, 2, max_held_bytes=MB))
-    vehicle.observations["1-1"].waits, vehicle.observations["1-1"].keeps = True, False
+    vehicle = VehicleBench(rig_of(2, 2, max_held_bytes=MB))
+    vehicle.observations["1-1"].is_waiting, vehicle.observations["1-1"].keeps = True, False
     points = 2048  # 24 kB
     for number in range(120):
         for index in range(2):
@@ -322,7 +357,7 @@ def test_pairs_wait_no_more_before_frames_are_refused(record_property: Callable[
     assert 0 < held < 20
     assert all(
         (kind, "memory_full") not in sensor.losses.snapshot()
-        for sensor in vehicle.intake.sensors
+        for sensor in vehicle.engine.sensors
         for kind in (CAMERA, LIDAR)
     )
 
@@ -330,9 +365,9 @@ def test_pairs_wait_no_more_before_frames_are_refused(record_property: Callable[
 @pytest.mark.fault("one camera of a vehicle falls silent", "its slice ends by the clock although all others go on")
 def test_silence_of_a_pair_is_noticed_while_others_speak(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 100.0
-    monkeypatch.setattr(pair_stream, "time", SimpleNamespace(monotonic=lambda: now_s))
-    vehicle = Vehicle(rig_of(2, 2))
-    vehicle.observations["0-0"].slice_end_ns = vehicle.observations["1-1"].slice_end_ns = BEGIN_NS + 20 * HZ10_NS
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    vehicle = VehicleBench(rig_of(2, 2))
+    vehicle.observations["0-0"].slice_end_ns = vehicle.observations["1-1"].slice_end_ns = BEGIN_NS + 20 * HZ10_NS + 1
     for number in range(20):
         now_s += 0.1
         vehicle.drive([number], 2, 2)
@@ -341,10 +376,10 @@ def test_silence_of_a_pair_is_noticed_while_others_speak(monkeypatch: pytest.Mon
         vehicle.put("camera/1", image(number, 1))
         vehicle.put("lidar/1", sweep(number))
         vehicle.settle()
-        for stream in vehicle.streams.values():
-            waiting = {sensor.number for sensor in stream.sensors.values()} & vehicle.intake.inbox.waiting()
-            stream.tick(waiting=bool(waiting))
-    assert vehicle.observations["0-0"].finished == [BEGIN_NS + 20 * HZ10_NS]
+        for pair in vehicle.pairs.values():
+            waiting = {sensor.number for sensor in pair.sensors.values()} & vehicle.engine.inbox.waiting()
+            pair.tick(waiting=bool(waiting))
+    assert vehicle.observations["0-0"].finished == [BEGIN_NS + 20 * HZ10_NS + 1]
     assert vehicle.observations["1-1"].finished == []
 
 
@@ -354,8 +389,8 @@ def test_frames_of_a_slice_that_silence_has_finished_are_counted(
     monkeypatch: pytest.MonkeyPatch, comes: int, counted: int
 ) -> None:
     now_s = 100.0
-    monkeypatch.setattr(pair_stream, "time", SimpleNamespace(monotonic=lambda: now_s))
-    vehicle = Vehicle(rig_of(1, 1))
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    vehicle = VehicleBench(rig_of(1, 1))
     observations, stream = vehicle.observations["0-0"], vehicle.streams["0-0"]
     observations.slice_end_ns = BEGIN_NS + 50 * HZ10_NS
     for number in range(20):
@@ -364,7 +399,7 @@ def test_frames_of_a_slice_that_silence_has_finished_are_counted(
     for _ in range(400):
         now_s += 0.1
         vehicle.settle()
-        stream.tick(waiting=False)
+        vehicle.pairs["0-0"].tick(waiting=False)
     assert observations.finished == [BEGIN_NS + 50 * HZ10_NS]
     vehicle.drive([comes, comes + 1], 1, 1)
     assert stream.losses().get(("window", "ended_too_early"), 0) == counted
@@ -376,8 +411,8 @@ def test_motion_is_of_every_lidar_that_it_moves() -> None:
     documents: list[dict[str, Any]] = [pair.model_dump(exclude_none=True) for pair in config.pairs]
     documents[0]["ego"] = {"key": "odometry"}
     documents[1]["ego"] = {"key": "odometry", "T_lidar_ego": T}
-    vehicle = Vehicle(Config.model_validate({"pairs": documents}))
-    assert [sensor.kind for sensor in vehicle.intake.sensors].count(EGO) == 1
+    vehicle = VehicleBench(Config.model_validate({"pairs": documents}))
+    assert [sensor.kind for sensor in vehicle.engine.sensors].count(EGO) == 1
     for number in range(5):
         vehicle.put("odometry", EgoMotion(BEGIN_NS + number * HZ10_NS, "ego", (5.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
         vehicle.drive([number], 1, 2)

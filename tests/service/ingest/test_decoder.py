@@ -28,9 +28,10 @@ from coec.io.ros import message_encoding
 from coec.io.zenoh.bus import InputSample
 from coec.io.zenoh.ros_node import RosTopicList
 from coec.service.api.problems import stream_problems
-from coec.service.engine.vehicle import Call, Inbox, Parcel, SensorStream
 from coec.service.ingest.decoder import CAMERA, EGO, LIDAR, RECENT, Decoder, Frame
 from coec.service.ingest.frame_buffers import FrameBudget
+from coec.service.ingest.inbox import Inbox, Parcel, Posted
+from coec.service.ingest.sensor_stream import SensorStream
 from support.ros import packed_cloud, transforms
 from support.scenes import ROOF_POSE, sweep_in_frame, turning_sweep
 
@@ -379,11 +380,11 @@ def test_a_sample_larger_than_all_that_may_wait_is_taken_alone() -> None:
     assert taken.sample.payload == b"next"
 
 
-def test_a_call_comes_before_what_waits_and_a_waiting_reader_is_woken() -> None:
+def test_an_event_comes_before_what_waits_and_a_waiting_reader_is_woken() -> None:
     inbox = Inbox({CAMERA: 2}, 100, lambda _: None)
     inbox.put(CAMERA, InputSample(b"", ""))
-    inbox.call(lambda: None)
-    assert isinstance(inbox.take(0.0), Call)
+    inbox.post("front", "event")
+    assert isinstance(inbox.take(0.0), Posted)
     assert isinstance(inbox.take(0.0), Parcel)
     got: list[object] = []
     reader = threading.Thread(target=lambda: got.append(inbox.take(60.0)))

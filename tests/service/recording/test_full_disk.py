@@ -17,7 +17,7 @@ from coec.config import CalibrationConfig, StateConfig
 from coec.geometry.cameras import build
 from coec.io.logs import LossCounter
 from coec.io.mcap.window_reader import read_window
-from coec.service.recording.recorder import Recorder, RecordingPlan
+from coec.service.recording.recorder import Recorder, RecordingPlan, RecordingThread, WindowLost, WindowRecorded
 from coec.service.recording.window_store import WindowStore
 from support.disk import FullDisk
 from support.fake_worker import wait_until
@@ -48,10 +48,13 @@ class Life:
         self.losses = LossCounter(logging.getLogger("test"), "front")
         self.recorded: list[str] = []
         self.lost: list[str] = []
-        self.recorder = Recorder(
-            PLAN, self.store, self.losses, lambda window_id, *_: self.recorded.append(window_id), self.lost.append
-        )
-        self.recorder.thread.start()
+        self.recording = RecordingThread()
+        self.recorder = Recorder(PLAN, self.store, self.losses, self.recording, self.post)
+        self.recording.thread.start()
+
+    def post(self, pair: str, event: WindowRecorded | WindowLost) -> None:
+        del pair
+        (self.recorded if isinstance(event, WindowRecorded) else self.lost).append(event.window_id)
 
     def window(self, start_ns: int) -> bool:
         """Whether a window of three pairs came to the disk; every window comes to one end."""
@@ -63,9 +66,9 @@ class Life:
         return name in self.recorded
 
     def stop(self) -> None:
-        self.recorder.request_stop()
-        assert self.recorder.thread.join(20.0)
-        assert self.recorder.thread.failure is None
+        self.recording.request_stop()
+        assert self.recording.thread.join(20.0)
+        assert self.recording.thread.failure is None
 
 
 @pytest.mark.fault(

@@ -55,12 +55,12 @@ def test_a_killed_recorder_has_all_that_it_reported(
         report += len(reported)
         windows, snippets = stores(tmp_path)
         before = {path.stem for path in windows.windows("front")}
-        recorder, _, losses = recorder_of(windows, snippets, [])
-        recorder.thread.start()
+        recording, _, _, losses = recorder_of(windows, snippets, [])
+        recording.thread.start()
         wait_until(lambda: not windows.unread("front"), "the digests")  # noqa: B023 - called at once
-        recorder.request_stop()
-        assert recorder.thread.join(DEADLINE_S)
-        assert recorder.thread.failure is None
+        recording.request_stop()
+        assert recording.thread.join(DEADLINE_S)
+        assert recording.thread.failure is None
         assert not list(tmp_path.rglob("*.part"))
         assert set(losses.snapshot()) <= {("window", "too_few_pairs_salvaged")}
         listed = {info.window_id: str(info.sha256) for info in windows.listing("front")}

@@ -32,6 +32,9 @@ from coec.service.recording.recorder import (
     UNSOLVED_RESUMED,
     Recorder,
     RecordingPlan,
+    RecordingThread,
+    WindowLost,
+    WindowRecorded,
 )
 from coec.service.recording.window_store import WindowStore
 from support.fake_worker import wait_until
@@ -70,20 +73,30 @@ class Bench:
         self.losses = LossCounter(logging.getLogger("test"), "front")
         self.recorded: queue.SimpleQueue[Recorded] = queue.SimpleQueue()
         self.lost: list[str] = []
-        self.recorder = Recorder(plan, store, self.losses, lambda *event: self.recorded.put(event), self.lost.append)
+        self.recording = RecordingThread()
+        self.recorder = Recorder(plan, store, self.losses, self.recording, self.post)
+
+    def post(self, pair: str, event: WindowRecorded | WindowLost) -> None:
+        """What the engine does, but for the solve."""
+        assert pair == "front"
+        if isinstance(event, WindowLost):
+            self.lost.append(event.window_id)
+        else:
+            self.store.release(event.window_id)
+            self.recorded.put((event.window_id, event.path, event.live))
 
     @contextmanager
     def running(self) -> Iterator[Recorder]:
-        self.recorder.thread.start()
+        self.recording.thread.start()
         try:
             yield self.recorder
         finally:
             self.stop()
 
     def stop(self) -> None:
-        self.recorder.request_stop()
-        assert self.recorder.thread.join(DEADLINE_S)
-        assert self.recorder.thread.failure is None
+        self.recording.request_stop()
+        assert self.recording.thread.join(DEADLINE_S)
+        assert self.recording.thread.failure is None
 
     def window(self, name: str, stamps: list[int]) -> None:
         for stamp_ns in stamps:
@@ -336,26 +349,28 @@ def test_problem_is_reported_in_the_text_of_the_disk_until_what_follows_can_be_w
 
 def test_a_window_cannot_be_removed_while_it_is_handed_over(tmp_path: Path) -> None:
     bench = Bench(store_of(tmp_path, min_free_bytes=2**62))
-    seen: list[bool] = []
+    posted: queue.SimpleQueue[WindowRecorded] = queue.SimpleQueue()
 
-    def make_room_meanwhile(window_id: str, path: Path, live: bool) -> None:
-        del live
-        later = bench.store.path("front-999")  # so that it is not the latest
-        later.write_bytes(b"later")
-        with suppress(RecordingError):
-            bench.store.make_room(lambda: None)
-        seen.append(path.exists())
-        bench.recorded.put((window_id, path, True))
+    def post(pair: str, event: WindowRecorded | WindowLost) -> None:
+        del pair
+        assert isinstance(event, WindowRecorded)
+        posted.put(event)
 
     writer = WindowWriter(bench.store.path("front-10"), RIG, NOMINAL, "front-10", CalibrationConfig(), {})
     writer.add(pair(10))
     writer.finish()
-    recorder = Recorder(PLAN, bench.store, bench.losses, make_room_meanwhile, bench.lost.append)
-    recorder.thread.start()
-    _, path, _ = bench.recorded.get(timeout=DEADLINE_S)
-    recorder.request_stop()
-    assert recorder.thread.join(DEADLINE_S)
-    assert seen == [True]
+    recording = RecordingThread()
+    Recorder(PLAN, bench.store, bench.losses, recording, post)
+    recording.thread.start()
+    event = posted.get(timeout=DEADLINE_S)
+    recording.request_stop()
+    assert recording.thread.join(DEADLINE_S)
+    path = event.path
+    bench.store.path("front-999").write_bytes(b"later")  # so that it is not the latest
+    with suppress(RecordingError):
+        bench.store.make_room(lambda: None)
+    assert path.exists()
+    bench.store.release(event.window_id)
     with pytest.raises(RecordingError):
         bench.store.make_room(lambda: None)
     assert not path.exists()
@@ -392,8 +407,8 @@ def test_a_stop_does_not_wait_for_windows_that_are_being_read(tmp_path: Path) ->
 def test_a_thread_that_the_disk_does_not_let_go_is_reported(tmp_path: Path) -> None:
     recorder = Bench(store_of(tmp_path)).recorder
     assert recorder.problem is None
-    recorder.thread._beat_s -= STUCK_S + 1.0  # since the last sign of life
+    recorder._thread._beat_s -= STUCK_S + 1.0  # since the last sign of life
     assert recorder.problem is not None
     assert (recorder.problem.code, "3 s" in recorder.problem.text) == ("recording_stuck", True)
-    recorder.thread.beat()
+    recorder._thread.beat()
     assert recorder.problem is None

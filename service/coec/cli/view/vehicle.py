@@ -28,8 +28,8 @@ from coec.io.zenoh.bus import StreamInput, input_of
 from coec.schemas.keys import Keys
 from coec.schemas.message import from_msgpack
 from coec.schemas.replies import AxisReply, ExtrinsicReply, HealthReply, Transform
-from coec.service.engine.vehicle import Inbox, Parcel
 from coec.service.ingest.decoder import CAMERA, EGO, LIDAR, Decoder
+from coec.service.ingest.inbox import Inbox, Parcel
 
 REPEAT_S = 1.0
 """Time between two lines of the timeline while nothing changes."""

@@ -41,7 +41,7 @@ from coec.service.api.reply_builders import (
 )
 from coec.service.discovery import info_topic_of
 from coec.service.discovery_listener import NominalStatus
-from coec.service.engine.pair import PairSnapshot
+from coec.service.engine.messages import PairSnapshot
 from coec.service.engine.pair_stream import PairStream
 from coec.service.recording.recorder import Recorder
 from coec.service.recording.snippets import SNIPPET, SnippetStore

@@ -17,8 +17,8 @@ from coec.calibration.rig.rig_estimator import RigAlarm, VehicleRig, rig_alarms
 from coec.calibration.types import Reason
 from coec.config import PairConfig
 from coec.io.zenoh.ros_node import RosTopicList, listed
-from coec.service.engine.vehicle import Arrivals
 from coec.service.ingest.decoder import StreamCounts
+from coec.service.ingest.inbox import Arrivals
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,17 +4,14 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import degrees
 from typing import Any, Literal
 
 import msgpack
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel
 
 import coec
@@ -25,17 +22,26 @@ from coec.calibration.types import Decision, Estimate, Reason, Rig, Uncertainty
 from coec.config import CameraIntrinsics, PairConfig
 from coec.geometry import se3
 from coec.io.exported_extrinsic import NOMINAL, ExportedExtrinsic, ExportFrames, ExtrinsicOrigin, between_frames
-from coec.io.serialise import degrees_or_null, intrinsics_of, number_or_null, reasons_of, result_of, transform_of
+from coec.io.serialise import (
+    candidate_of,
+    degrees_and_metres,
+    degrees_or_null,
+    intrinsics_of,
+    number_or_null,
+    reasons_of,
+    result_of,
+    transform_of,
+)
 from coec.io.zenoh.bus import JSON, MSGPACK, Answer
 from coec.schemas import replies
 from coec.schemas.keys import Format
 from coec.schemas.message import to_json, to_msgpack
 from coec.schemas.replies import CalibrationResult
 from coec.service.cpu_budget import BudgetReport
-from coec.service.engine.pair import HELD, PairSnapshot
-from coec.service.engine.pair_stream import StreamStatistics
-from coec.service.engine.vehicle import Arrivals
+from coec.service.engine.messages import PairSnapshot, StreamStatistics
+from coec.service.engine.pair import HELD
 from coec.service.ingest.decoder import CAMERA, EGO, LIDAR, StreamCounts
+from coec.service.ingest.inbox import Arrivals
 from coec.service.timing import NS_PER_S
 from coec.service.worker import compilation
 from coec.service.worker.supervisor import Worker, WorkerState
@@ -111,29 +117,6 @@ def hold_of(state: PairState) -> replies.Hold | None:
     if hold is None:
         return None
     return replies.Hold(since_ns=hold.since_ns, sender=hold.sender, reason=hold.reason or None)
-
-
-def candidate_of(state: PairState) -> replies.Candidate | None:
-    """The candidate that waits for `apply`; None if there is none."""
-    if state.pending is None:
-        return None
-    pending = state.pending
-    window_id = pending.estimate.window_id
-    content = f"{window_id}\n".encode() + pending.T_camera_lidar.astype("<f8").tobytes()
-    return replies.Candidate(
-        window_id=window_id,
-        sha256=hashlib.sha256(content).hexdigest(),
-        data_stamp_ns=pending.estimate.data_stamp_ns,
-        camera_from_lidar=transform_of(pending.T_camera_lidar),
-        step=degrees_and_metres(step_between(state.T_camera_lidar, pending.T_camera_lidar)),
-        waits=replies.Reason(code=pending.waits.code, text=pending.waits.text),
-    )
-
-
-def degrees_and_metres(rad_m: NDArray[np.float64]) -> replies.Vector6:
-    """(6,) radians and metres in the units of the wire, degrees and metres."""
-    a, b, c, x, y, z = (float(value) for value in rad_m)
-    return degrees(a), degrees(b), degrees(c), x, y, z
 
 
 def uncertainty_of_served(state: PairState) -> Uncertainty | None:

@@ -11,8 +11,8 @@ from coec.calibration.monitor.change_detector import ACQUITTAL_PERIODS
 from coec.calibration.state import NOT_ACQUITTED
 from coec.calibration.types import Reason
 from coec.errors import ModelError
-from coec.service.engine.job_client import RESULT_PERIODS
-from coec.service.engine.pair_stream import StreamStatistics
+from coec.service.engine.frame_selector import RESULT_PERIODS
+from coec.service.engine.messages import StreamStatistics
 from coec.service.ingest.decoder import CAMERA, LIDAR
 from coec.service.timing import NS_PER_S
 from coec.service.worker import compilation

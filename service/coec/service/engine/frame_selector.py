@@ -1,14 +1,12 @@
-"""Decides what each pair of frames is used for, one after the other: a window, a check, or nothing.
+"""Selects what each frame pair is used for, one after the other: a window, a check, or nothing.
 
-The decision depends only on sensor time and on earlier questions: before a pair is looked at, every answer that is due
-by its stamp has taken effect. So a replay of a drive gives the same windows and checks, at any rate and on any machine.
+The selection depends only on sensor time and on earlier requests: before a frame pair is evaluated, every result that
+is due by its stamp has taken effect. So a replay of a drive gives the same windows and checks, at any rate and on any
+machine.
 """
 
 import logging
-import time
 from collections import deque
-from dataclasses import dataclass
-from typing import Protocol
 
 from coec.calibration.frames.window import (
     CarriedOverPairs,
@@ -18,123 +16,53 @@ from coec.calibration.frames.window import (
     SliceClosed,
     UrgentWindow,
     WindowCutter,
+    stands,
 )
-from coec.calibration.types import FramePair, ImageQuality, Matrix4, Rig
-from coec.config import MAX_SLICE_S, LimitsConfig, PairConfig, WindowConfig
+from coec.calibration.types import FramePair, Rig
+from coec.config import MAX_SLICE_S, LimitsConfig, PairConfig
 from coec.io.depth.depth_maps import STEREO
 from coec.io.images import CompressingReducer, Inspector
 from coec.io.logs import LossCounter
-from coec.io.msgpack_frames import encode_camera
-from coec.service.timing import SensorClock
+from coec.service.cpu_budget import Budget
+from coec.service.engine.messages import (
+    Action,
+    CheckSubject,
+    PairSchedule,
+    Prefetch,
+    RecordBetween,
+    RecordPair,
+    SelectionChange,
+    SelectionStatistics,
+    SubmitCheck,
+    UseCalibration,
+    WindowSubject,
+)
+from coec.service.engine.rig import RigMember
+from coec.service.recording.window_store import start_ns_of
+from coec.service.records.pair_store import ServedExtrinsic
+from coec.service.timing import NS_PER_S, SensorClock
+from coec.service.worker.worker_jobs import DEADLINE_S, Kind
 
 _log = logging.getLogger(__name__)
 
 CHECKS_WAITING = 4
-"""How many checks may wait for the answer to a window, 15 MB each: one for the period in which that answer is awaited,
+"""How many checks may wait for the result of a window, 15 MB each: one for the period in which that result is awaited,
 and one more for each further window that ends meanwhile."""
 
+RESULT_PERIODS = 1
+"""After so many periods of the monitor the result of a check or a window counts in the selection of further frames. At
+5 s this is longer than either takes. If a result takes longer, the stream waits, and its frame pairs are held."""
+
+GRACE_S = 30.0
+"""Time beyond the worker's deadline, s, for a result to get from there to here, and for a window to get to the disk.
+After that it is given up as lost."""
 
 PROGRESS_S = 15.0
-"""Time between two lines of the log about the pairs of a window, s."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ServedExtrinsic:
-    """An extrinsic (4, 4) that is or was served; `epoch` counts the extrinsics that were served."""
-
-    epoch: int
-    T_camera_lidar: Matrix4
-
-
-class JobRequester(Protocol):
-    """What the chooser asks of the rest of the service; see `runtime.decisions.questions`."""
-
-    @property
-    def stretch(self) -> float:
-        """Factor by which slices are to be longer than configured, at least 1."""
-
-    def try_acquire(self, stamp_ns: int, *, suspected: bool) -> bool:
-        """Whether the budget allows a check at a sensor time. If it does, the caller must ask for that check. Checks of
-        `suspected` pairs come first."""
-
-    def pop_window_request(self, stamp_ns: int) -> int | None:
-        """Sensor time since which the rig wants pairs for a window, asked before a pair of this stamp; returned once.
-        None: it wants no window."""
-
-    def window_turn_s(self, stamp_ns: int) -> float:
-        """By how much the end of a window that the rig wants may be delayed, s, so that the budget can pay for the
-        windows before it. The window then counts as being on its way."""
-
-    def check(self, pairs: tuple[FramePair, ...], served: ServedExtrinsic, stamp_ns: int) -> None:
-        """Asks at a sensor time whether `served` is right according to these pairs. Only after `affords`."""
-
-    def window(self, window_id: str, stamp_ns: int) -> int:
-        """Asks for the result of a window that ends at a sensor time. Returns from which sensor time the answer
-        counts."""
-
-    def prefetch(self, frame: bytes) -> None:
-        """Announces that the depth of a camera frame (native msgpack) will be needed."""
-
-    @property
-    def unanswered(self) -> int:
-        """Number of checks and windows whose answer has not come."""
-
-    def waits(self, stamp_ns: int) -> bool:
-        """Whether an answer is due before a pair of this stamp and has not come."""
-
-    def settle(self, stamp_ns: int) -> None:
-        """Lets the answers take effect that are due before a pair of this stamp."""
-
-    def bring_forward(self, stamp_ns: int) -> None:
-        """Makes all outstanding answers due before a pair of this stamp, which is the first after a step back of sensor
-        time."""
-
-    def time_stepped_back(self, stamp_ns: int) -> None:
-        """The clock of the sensors has stepped back, to this stamp."""
-
-
-class WindowSink(Protocol):
-    """What the chooser hands to the recorder."""
-
-    def add(self, window_id: str, pair: FramePair, T_camera_lidar: Matrix4) -> None:
-        """A pair was chosen for a window."""
-
-    def add_between(self, window_id: str, pair: FramePair) -> None:
-        """A thinned pair is to be recorded beside the chosen ones."""
-
-    def end(self, closed: SliceClosed) -> None:
-        """A slice ended."""
-
-
-@dataclass(frozen=True, slots=True)
-class SelectionStatistics:
-    """What was chosen so far.
-
-    Attributes:
-        selected: number of pairs in the open slice.
-        rejections: number of pairs that were looked at for a window and refused, by reason.
-        quality: quality of the latest image that was looked at; None before the first.
-        frozen: whether images have repeated since the last chosen one.
-        checks: number of checks that were asked for.
-        not_afforded: number of checks that never got their turn.
-        last_ns: stamp of the latest pair that was looked at; None before the first.
-        steps_back: how often sensor time has stepped back.
-        unanswered: number of checks and windows whose answer has not come.
-    """
-
-    selected: int = 0
-    rejections: tuple[tuple[str, int], ...] = ()
-    quality: ImageQuality | None = None
-    frozen: bool = False
-    checks: int = 0
-    not_afforded: int = 0
-    last_ns: int | None = None
-    steps_back: int = 0
-    unanswered: int = 0
+"""Time between two lines of the log about the frame pairs of a window, s."""
 
 
 class FrameSelector:
-    """Belongs to the ingest thread of a pair."""
+    """The selection of one pair. What its methods return is to be done outside."""
 
     def __init__(
         self,
@@ -142,21 +70,22 @@ class FrameSelector:
         limits: LimitsConfig,
         rig: Rig,
         served: ServedExtrinsic,
-        requester: JobRequester,
-        recorder: WindowSink,
+        schedule: PairSchedule,
+        budget: Budget,
+        member: RigMember,
         losses: LossCounter,
         first_slice_s: float,
         carried_over: CarriedOverPairs | None = None,
     ) -> None:
-        """`served` is the extrinsic at which pairs are looked at until another is adopted. `kept` are pairs of an
-        earlier run that belong to the first window."""
-        self._name = pair.name
-        self._logged_s = -PROGRESS_S
-        self._requester = requester
-        self._recorder = recorder
+        """`served` is the extrinsic at which frame pairs are evaluated until another is served. `carried_over` are
+        pairs of an earlier run that belong to the first window."""
+        self._pair = pair
+        self._schedule, self._budget, self._member = schedule, budget, member
         self._losses = losses
         self._served = served
         self._infers = pair.calibration.depth.model != STEREO
+        # The period stays that of the start, because the due times of open requests were set by it.
+        self._period_ns = round(pair.monitor.period_s * NS_PER_S)
         self._window, self._stretch = pair.window, 1.0
         self._cutter = WindowCutter(pair.window, rig, Inspector(limits), CompressingReducer(limits))
         if first_slice_s < pair.window.slice_s:
@@ -166,19 +95,19 @@ class FrameSelector:
         self._sampler = CheckSampler(pair.monitor)
         self._urgency = UrgentWindow(pair.monitor)
         self._pace = SensorClock()
-        self._last_ns: int | None = None
         self._waiting_checks: deque[tuple[FramePair, ...]] = deque(maxlen=CHECKS_WAITING)
-        self._window_due_ns = 0
-        self._frozen = False
-        self._suspected = False
-        self._checks = 0
-        self._not_afforded = 0
         self._waits_its_turn = False
-        self._steps_back = 0
+        self._suspected = False
+        self._frozen = False
+        self._last_ns: int | None = None
+        self._window_due_ns = self._latest_window_ns = 0
+        self._checks = self._not_afforded = self._steps_back = 0
+        self._counted_s = 0.0
+        self._logged_s = -PROGRESS_S
 
     @property
     def statistics(self) -> SelectionStatistics:
-        """What was chosen so far."""
+        """What was selected so far."""
         return SelectionStatistics(
             self._cutter.selected,
             tuple((cause, count) for cause, count in self._cutter.rejections.items() if count),
@@ -188,7 +117,7 @@ class FrameSelector:
             self._not_afforded,
             self._last_ns,
             self._steps_back,
-            self._requester.unanswered,
+            self._schedule.unanswered,
         )
 
     @property
@@ -196,150 +125,147 @@ class FrameSelector:
         """Sensor time at which the open slice ends; None when none is open."""
         return self._cutter.slice_end_ns
 
-    def must_wait(self, stamp_ns: int) -> bool:
-        """Whether a pair of this stamp may not be looked at yet, because an answer is missing. The first pair after a
-        step back of sensor time makes all outstanding answers due. A slice that is over by this stamp is ended
-        first."""
-        if self._has_stepped_back(stamp_ns):
-            self._requester.bring_forward(stamp_ns)
-        elif not self.end_slice_by(stamp_ns):
-            return True
-        return self._requester.waits(stamp_ns)
+    def is_step_back(self, stamp_ns: int) -> bool:
+        """Whether sensor time has stepped back if this is the stamp of the next frame pair."""
+        return self._last_ns is not None and stamp_ns < self._last_ns
 
-    def choose(self, pair: FramePair) -> None:
-        """Looks at the next pair and uses it for the window, for a check, or not at all."""
-        stepped_back = self._has_stepped_back(pair.stamp_ns)
-        if stepped_back:
-            self._requester.bring_forward(pair.stamp_ns)
-        elif self._slice_is_over(pair.stamp_ns):
-            self._end_slice()
-        if self._requester.waits(pair.stamp_ns):
-            self._losses.add("monitor", "not_awaited")
-        self._requester.settle(pair.stamp_ns)
-        if stepped_back:
-            self._begin_new_time(pair.stamp_ns)
-        self._last_ns = pair.stamp_ns
-        # No steady clock is given, because this `SensorClock` only measures the rate at which pairs come.
-        self._pace.observe(pair.stamp_ns, 0.0)
-        self._follow_stretch()
-        self._follow_rig(pair.stamp_ns)
+    def ends_slice(self, stamp_ns: int) -> bool:
+        """Whether the open slice is over at this sensor time."""
+        end_ns = self._cutter.slice_end_ns
+        return end_ns is not None and stamp_ns >= end_ns
+
+    def tick(self, counted_s: float) -> None:
+        """`counted_s`: the time by which requests expire."""
+        self._counted_s = counted_s
+
+    def reconfigure(self, pair: PairConfig) -> None:
+        """Cuts the next slice, and requests checks, by these settings."""
+        self._pair = pair
+        self._window, self._stretch = pair.window, 1.0
+        self._cutter.reconfigure(pair.window)
+
+    def expires_s(self, kind: Kind) -> float:
+        """When the result of a job that is submitted now is given up."""
+        return self._counted_s + DEADLINE_S[kind] + GRACE_S
+
+    # --- selection --------------------------------------------------------------------------------------------------
+
+    def select(self, pair: FramePair) -> list[Action]:
+        """Evaluates the next frame pair and uses it for the window, for a check, or not at all."""
+        stamp_ns = pair.stamp_ns
+        actions: list[Action] = []
+        if self.is_step_back(stamp_ns):
+            self._schedule.bring_forward(stamp_ns)
+            actions += self._apply_due(stamp_ns)
+            self._begin_new_time(stamp_ns)
+        else:
+            if self.ends_slice(stamp_ns):
+                actions += self.end_slice()
+            actions += self._apply_due(stamp_ns)
+        self._last_ns = stamp_ns
+        # No steady clock is given, because this `SensorClock` only measures the rate at which frame pairs come.
+        self._pace.observe(stamp_ns, 0.0)
+        self._follow_budget()
+        self._follow_rig(stamp_ns)
         for closed in self._urgency.apply(self._cutter, self._pace.rate_hz):
-            self._end(closed, pair.stamp_ns)
-        frozen_before = self._cutter.rejections["frozen"]
-        T_camera_lidar = self._served.T_camera_lidar
-        for event in self._cutter.offer(pair, T_camera_lidar):
-            if isinstance(event, PairSelected):
-                self._frozen = False
-                self._select(event, T_camera_lidar)
-            elif isinstance(event, PairBetween):
-                self._recorder.add_between(event.window_id, event.pair)
-            elif isinstance(event, SliceClosed):
-                self._end(event, pair.stamp_ns)
-                self._urgency.on_slice_closed(event, self._cutter, self._pace.rate_hz)
-            else:
-                lost = event.carried_over
-                detail = f"pairs of {lost.window_id} since {lost.since_ns} ns are in no other window"
-                self._losses.add("window", "kept_pairs_forgotten", lost.pairs, detail=detail)
-        self._frozen |= self._cutter.rejections["frozen"] > frozen_before
+            actions.append(self._close(closed, stamp_ns))
+        actions += self._offer_to_window(pair)
         check = self._sampler.offer(pair)
         if check is not None:
             self._await_turn(check)
-        if pair.stamp_ns >= self._window_due_ns:
-            self._submit_checks(pair.stamp_ns)
+        if stamp_ns >= self._window_due_ns:
+            actions += self._submit_checks(stamp_ns)
+        return actions
 
-    def end_slice_by(self, now_ns: int) -> bool:
-        """Ends the open slice if it is over at this sensor time. Returns False while an answer that counts by the end
-        of the slice has not come.
-
-        The slice ends at its own end, whether a pair or silence tells the time; so the answer to its window counts from
-        the same time on in both cases."""
-        if not self._slice_is_over(now_ns):
-            return True
+    def end_slice(self) -> list[Action]:
+        """Ends the open slice at its end, whether a frame pair or silence tells the time; the results that count by
+        then take effect first. So the result of its window counts from the same time on in both cases."""
         end_ns = self._cutter.slice_end_ns
-        if end_ns is not None and self._requester.waits(end_ns):
-            return False
-        self._end_slice()
-        return True
+        if end_ns is None:
+            return []
+        actions = self._apply_due(end_ns)
+        for closed in self._urgency.apply(self._cutter, self._pace.rate_hz):
+            actions.append(self._close(closed, end_ns))
+        for closed in self._cutter.advance(end_ns):
+            actions.append(self._close(closed, end_ns))
+            self._urgency.on_slice_closed(closed, self._cutter, self._pace.rate_hz)
+        return actions
 
     def finish(self) -> SliceClosed | None:
-        """Ends the open slice at once."""
-        for event in self._cutter.finish():
-            self._end(event, self._last_ns or 0)
-            return event
+        """Ends the open slice at once; None if none is open. The `SliceClosed` is an action."""
+        for closed in self._cutter.finish():
+            return self._close(closed, self._last_ns or 0)
         return None
 
-    def reconfigure(self, window: WindowConfig) -> None:
-        """Cuts the next slice by these settings."""
-        self._window, self._stretch = window, 1.0
-        self._cutter.reconfigure(window)
+    # --- changes by results -----------------------------------------------------------------------------------------
 
-    # --- effects of answers -----------------------------------------------------------------------------------------
+    def apply(self, change: SelectionChange) -> list[Action]:
+        """Takes over what a result changes."""
+        if change.served is not None and change.served.epoch > self._served.epoch:
+            self._served = change.served
+        if change.carried_over is not None:
+            self._cutter.carry_over(change.carried_over)
+        if change.is_calm:
+            self._suspected = False
+            self._urgency.calm()
+        if change.urgent_since_ns is not None:
+            self._suspected = True
+            self._urgency.alarm(change.urgent_since_ns)
+        return [] if change.calibration is None else [UseCalibration(change.calibration)]
 
-    def adopt(self, served: ServedExtrinsic) -> None:
-        """Looks at pairs with another extrinsic from now on."""
-        if served.epoch > self._served.epoch:
-            self._served = served
-
-    def alarm(self, since_ns: int) -> None:
-        """A suspicion arose: a window of pairs since this sensor time is wanted soon."""
-        self._suspected = True
-        self._urgency.alarm(since_ns)
-
-    def carry_over(self, carried_over: CarriedOverPairs) -> None:
-        """The camera moved within a window; the pairs after the move belong to the next window."""
-        self._cutter.carry_over(carried_over)
-
-    def calm(self) -> None:
-        """There is no suspicion any more."""
-        self._suspected = False
-        self._urgency.calm()
-
-    # --- inside -----------------------------------------------------------------------------------------------------
+    def _apply_due(self, stamp_ns: int) -> list[Action]:
+        return [action for change in self._schedule.take_due(stamp_ns) for action in self.apply(change)]
 
     def _begin_new_time(self, stamp_ns: int) -> None:
         self._steps_back += 1
         self._losses.add("monitor", "time_stepped_back", detail="the clock of the sensors stepped back")
-        self.calm()
+        self._suspected = False
+        self._urgency.calm()
         self._urgency.forget()
-        self._window_due_ns = stamp_ns
-        self._requester.time_stepped_back(stamp_ns)
+        self._window_due_ns, self._latest_window_ns = stamp_ns, 0
 
-    def _has_stepped_back(self, stamp_ns: int) -> bool:
-        return self._last_ns is not None and stamp_ns < self._last_ns
+    # --- inside -----------------------------------------------------------------------------------------------------
 
-    def _slice_is_over(self, now_ns: int) -> bool:
-        end_ns = self._cutter.slice_end_ns
-        return end_ns is not None and now_ns >= end_ns
-
-    def _end_slice(self) -> None:
-        """Ends the open slice at its end; the answers that count by then take effect first."""
-        end_ns = self._cutter.slice_end_ns
-        if end_ns is None:
-            return
-        self._requester.settle(end_ns)
-        for closed in self._urgency.apply(self._cutter, self._pace.rate_hz):
-            self._end(closed, end_ns)
-        for closed in self._cutter.advance(end_ns):
-            self._end(closed, end_ns)
-            self._urgency.on_slice_closed(closed, self._cutter, self._pace.rate_hz)
-
-    def _follow_stretch(self) -> None:
+    def _follow_budget(self) -> None:
         """Makes slices longer if the budget does not suffice for all windows, just as periods of checks get longer."""
-        stretch = self._requester.stretch
+        stretch = self._budget.stretch
         if stretch != self._stretch:
             self._stretch = stretch
             slice_s = min(stretch * self._window.slice_s, MAX_SLICE_S)
             self._cutter.reconfigure(self._window.model_copy(update={"slice_s": slice_s}))
 
     def _follow_rig(self, stamp_ns: int) -> None:
-        """If the rig has named a sensor of this pair as moved, hurries a window: the repair waits for a window of each
-        pair of that sensor."""
-        since_ns = self._requester.pop_window_request(stamp_ns)
-        if since_ns is not None and not self._urgency.is_waiting:
-            self._urgency.request(since_ns, self._requester.window_turn_s(stamp_ns))
+        """If the rig has named a sensor of this pair as moved, hurries a window: the correction waits for a window of
+        each pair of that sensor. A window that began after the move may be on its way already."""
+        since_ns = self._member.pop_window_request(stamp_ns)
+        if since_ns is not None and since_ns > self._latest_window_ns and not self._urgency.is_waiting:
+            self._urgency.request(since_ns, self._budget.window_turn_s(self._pair.name, stamp_ns))
+
+    def _offer_to_window(self, pair: FramePair) -> list[Action]:
+        actions: list[Action] = []
+        frozen_before = self._cutter.rejections["frozen"]
+        T_camera_lidar = self._served.T_camera_lidar
+        for event in self._cutter.offer(pair, T_camera_lidar):
+            if isinstance(event, PairSelected):
+                self._frozen = False
+                actions.append(RecordPair(event.window_id, event.pair, T_camera_lidar))
+                if self._infers:
+                    actions.append(Prefetch(event.pair.camera))
+                self._log_progress(event.window_id)
+            elif isinstance(event, PairBetween):
+                actions.append(RecordBetween(event.window_id, event.pair))
+            elif isinstance(event, SliceClosed):
+                actions.append(self._close(event, pair.stamp_ns))
+                self._urgency.on_slice_closed(event, self._cutter, self._pace.rate_hz)
+            else:
+                lost = event.carried_over
+                detail = f"pairs of {lost.window_id} since {lost.since_ns} ns are in no other window"
+                self._losses.add("window", "kept_pairs_forgotten", lost.pairs, detail=detail)
+        self._frozen |= self._cutter.rejections["frozen"] > frozen_before
+        return actions
 
     def _await_turn(self, check: tuple[FramePair, ...]) -> None:
-        """Queues pairs for a check. Pairs of an earlier period that still wait for their turn are dropped as too
+        """Queues frame pairs for a check. Those of an earlier period that still wait for their turn are dropped as too
         old."""
         if self._waits_its_turn:
             self._not_afforded += len(self._waiting_checks)
@@ -349,38 +275,48 @@ class FrameSelector:
             self._losses.add("monitor", "check_superseded")
         self._waiting_checks.append(check)
 
-    def _submit_checks(self, stamp_ns: int) -> None:
-        """Has the latest pairs checked at the served extrinsic when it is their turn. Not called while a window is to
-        change that extrinsic, because the check would judge one that is no longer served."""
+    def _submit_checks(self, stamp_ns: int) -> list[Action]:
+        """Has the latest frame pairs checked at the served extrinsic when it is their turn. Not called while a window
+        is to change that extrinsic, because the check would judge one that is no longer served."""
         self._waits_its_turn = False
+        actions: list[Action] = []
         while self._waiting_checks:
-            if not self._requester.try_acquire(stamp_ns, suspected=self._suspected):
+            if not self._budget.try_acquire(self._pair.name, stamp_ns, suspected=self._suspected):
                 self._waits_its_turn = True
-                return
+                break
             self._checks += 1
-            self._requester.check(self._waiting_checks.popleft(), self._served, stamp_ns)
+            pairs = self._waiting_checks.popleft()
+            standing = tuple(pair.stamp_ns for pair in pairs if stands(pair, self._pair.window))
+            request = self._schedule.submit(
+                CheckSubject(self._served.epoch, standing),
+                stamp_ns + RESULT_PERIODS * self._period_ns,
+                self.expires_s(Kind.CHECK),
+            )
+            actions.append(SubmitCheck(request, pairs, self._served, self._pair.calibration))
+        return actions
 
-    def _select(self, event: PairSelected, T_camera_lidar: Matrix4) -> None:
-        self._log_progress(event.window_id)
-        self._recorder.add(event.window_id, event.pair, T_camera_lidar)
-        if self._infers:
-            self._requester.prefetch(encode_camera(event.pair.camera))
+    def _close(self, closed: SliceClosed, stamp_ns: int) -> SliceClosed:
+        """A slice ended at this sensor time: its frame pairs go to the disk, and from there to the worker."""
+        if closed.complete:
+            self._latest_window_ns = start_ns_of(closed.window_id)
+            due_ns = stamp_ns + RESULT_PERIODS * self._period_ns
+            request = self._schedule.submit(WindowSubject(closed.window_id), due_ns, self.expires_s(Kind.SOLVE))
+            self._window_due_ns = request.due_ns
+        fields = {
+            "pair": self._pair.name,
+            "window": closed.window_id,
+            "pairs": closed.pairs,
+            "complete": closed.complete,
+        }
+        enough = "it is recorded" if closed.complete else f"too few, {self._window.min_pairs} are needed"
+        _log.info(f"window ended with {closed.pairs} pairs: {enough}", extra={"fields": fields})
+        self._logged_s = -PROGRESS_S
+        return closed
 
     def _log_progress(self, window_id: str) -> None:
-        """Logs how many pairs the open window has, at a bounded rate."""
-        now_s = time.monotonic()
-        if now_s - self._logged_s < PROGRESS_S:
+        """Logs how many frame pairs the open window has, at a bounded rate."""
+        if self._counted_s - self._logged_s < PROGRESS_S:
             return
-        self._logged_s = now_s
-        fields = {"pair": self._name, "window": window_id}
+        self._logged_s = self._counted_s
+        fields = {"pair": self._pair.name, "window": window_id}
         _log.info(f"window: {self._cutter.selected} of {self._window.pairs} pairs", extra={"fields": fields})
-
-    def _end(self, event: SliceClosed, stamp_ns: int) -> None:
-        """A slice ended at this sensor time: its pairs go to the disk, and from there to the worker."""
-        if event.complete:
-            self._window_due_ns = self._requester.window(event.window_id, stamp_ns)
-        fields = {"pair": self._name, "window": event.window_id, "pairs": event.pairs, "complete": event.complete}
-        enough = "it is recorded" if event.complete else f"too few, {self._window.min_pairs} are needed"
-        _log.info(f"window ended with {event.pairs} pairs: {enough}", extra={"fields": fields})
-        self._logged_s = -PROGRESS_S
-        self._recorder.end(event)

@@ -1,5 +1,5 @@
 """Registers the LiDARs of a vehicle against each other: plans which two of them are registered, takes their sweeps on
-the thread of the intake, submits a registration to the worker, and reports its result to the rig.
+the thread of the engine, submits a registration to the worker, and reports its result to the rig.
 
 Only sensor time decides which sweeps are taken, and from when their result counts, so a replay of a drive gives the
 same at any rate. The rig waits for everything that counts by its sensor time (`schedule`).
@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
+from math import inf
 
 import numpy as np
 
@@ -21,10 +22,19 @@ from coec.calibration.types import EgoMotion, LidarFrame, Matrix4, Reason, Rig
 from coec.config import LidarEdgesConfig, PairConfig
 from coec.io import nearest_neighbours
 from coec.io.rig_files import rig_of
-from coec.service.cpu_budget import Budget
-from coec.service.engine import rig
-from coec.service.engine.vehicle import Intake, SensorStream
+from coec.service.engine.messages import JobDone
+from coec.service.engine.rig import (
+    LidarPairReport,
+    LidarPairStatus,
+    LidarState,
+    Registration,
+    graph_of,
+    sensors_of,
+)
+from coec.service.engine.schedule import Request, Schedule
+from coec.service.engine.vehicle import Vehicle
 from coec.service.ingest.decoder import EGO, LIDAR, Frame
+from coec.service.ingest.sensor_stream import SensorStream
 from coec.service.timing import NS_PER_S
 from coec.service.worker import worker_jobs
 from coec.service.worker.supervisor import Worker
@@ -91,7 +101,7 @@ def plan_lidar_pairs(pairs: Iterable[PairConfig], period_s: float) -> tuple[Lida
     rigs = {pair.name: (pair, rig_of(pair)) for pair in pairs}
     lidars: dict[str, LidarOfPair] = {}
     for pair, rig in rigs.values():
-        name = rig.sensors_of(pair)[1]
+        name = sensors_of(pair)[1]
         lidars.setdefault(name, LidarOfPair(name, pair, rig))
     if len(lidars) < 2:
         return ()
@@ -111,7 +121,7 @@ def _places(pairs: Mapping[str, tuple[PairConfig, Matrix4]]) -> dict[str, Mappin
     """T_sensor_origin (4, 4) by origin and sensor, for sensors that are joined by pairs; empty if there are more
     sensors than a rig may have."""
     try:
-        graph = rig.graph_of(pairs, ())
+        graph = graph_of(pairs, ())
     except ValueError:
         return {}
     return {sensor.name: graph.joined_to(sensor.name) for sensor in graph.sensors}
@@ -149,49 +159,38 @@ MISSED: Mapping[str, Reason] = {
 }
 
 
-@dataclass(slots=True, eq=False)
-class _PendingRegistration:
-    """A look that was asked for. `rests`: how many looks are left out after it, from its `due_ns` on; None until its
-    answer has come."""
+@dataclass(frozen=True, slots=True, eq=False)
+class RegistrationSubject:
+    """The sweeps of a registration: of the first and the last one, and what was lost before them."""
 
-    due_ns: int
     start_ns: int
     stamp_ns: int
     losses: Mapping[str, int]
-    rests: int | None = None
+
+
+RegistrationRequest = Request[RegistrationSubject, JobOutcome, int]
+"""What a registration changes is how many are left out after it."""
 
 
 class LidarPairStream:
-    """The looks at two LiDARs. Everything but `unanswered` belongs to the thread of the intake.
+    """The registrations of two LiDARs. Everything belongs to the thread of the engine.
 
     Attributes:
         sensors: the streams of both LiDARs and of the vehicle's motion.
-        unanswered: number of looks that were asked for and have no answer; for any thread.
     """
 
-    def __init__(
-        self,
-        lidars: LidarPairPlan,
-        period_s: float,
-        intake: Intake,
-        worker: Worker,
-        budget: Budget,
-        rig: rig.RigEstimatorThread,
-    ):
+    def __init__(self, lidars: LidarPairPlan, period_s: float, vehicle: Vehicle, worker: Worker):
         a, b = lidars.a.pair, lidars.b.pair
         assert a.ego is not None
         self.sensors: Mapping[str, SensorStream] = {
-            "a": intake.sensor(LIDAR, a.lidar),
-            "b": intake.sensor(LIDAR, b.lidar),
-            EGO: intake.sensor(EGO, a.ego),
+            "a": vehicle.sensor(LIDAR, a.lidar),
+            "b": vehicle.sensor(LIDAR, b.lidar),
+            EGO: vehicle.sensor(EGO, a.ego),
         }
-        self.unanswered = 0
         self._name = lidars.edge.name
         self._lidars = lidars.rig
-        self._inbox = intake.inbox
+        self._vehicle = vehicle
         self._worker = worker
-        self._budget = budget
-        self._rig = rig
         self._sampler = lidar_sampling.SweepSampler(
             period_s,
             a.pairing.motion_tolerance_s,
@@ -201,19 +200,29 @@ class LidarPairStream:
             timed_b=b.lidar.sweep is not None,
         )
         self._sweep_sets: deque[lidar_sampling.SweepSet] = deque()
-        self._pending: deque[_PendingRegistration] = deque()
+        self._schedule: Schedule[RegistrationSubject, JobOutcome, int] = Schedule()
         self._losses: Counter[str] = Counter()
         self._resting = 0
         self._missed = ""
         self._tried_ns: int | None = None
-        rig.join_lidars(rig.LidarPairStatus(lidars.edge), lambda: self.unanswered == 0)
-        budget.join_checks(self._name, period_s)
-        intake.join(self)
+        vehicle.rig.join_lidars(LidarPairStatus(lidars.edge))
+        vehicle.budget.join_checks(self._name, period_s)
+        vehicle.join(self)
+
+    @property
+    def name(self) -> str:
+        """Name of the edge between the two."""
+        return self._name
+
+    @property
+    def unanswered(self) -> int:
+        """Number of registrations that were requested and have no result."""
+        return self._schedule.unanswered
 
     # --- frames -----------------------------------------------------------------------------------------------------
 
     def taker(self, name: str) -> Callable[[Frame], None]:
-        """See `intake.Takes`."""
+        """The function that takes the frames of one of its streams."""
         return {"a": self._take_a, "b": self._take_b, EGO: self._take_motion}[name]
 
     def _take_a(self, frame: Frame) -> None:
@@ -252,30 +261,25 @@ class LidarPairStream:
         """No look was possible; reports the cause to the rig if it is new."""
         if missed.cause != self._missed:
             self._missed = missed.cause
-            report = rig.LidarPairReport(missed.stamp_ns, None, (MISSED[missed.cause],), self._lost())
-            self._rig.put(self._name, missed.stamp_ns + COUNTS_AFTER_NS, report)
+            report = LidarPairReport(missed.stamp_ns, None, (MISSED[missed.cause],), self._lost())
+            self._vehicle.rig.put(self._name, missed.stamp_ns + COUNTS_AFTER_NS, report)
 
     # --- turns ------------------------------------------------------------------------------------------------------
 
-    def may_choose(self) -> bool:
-        """Whether a look waits, every answer that counts before it has come, and the budget did not refuse it just
-        now."""
+    def advance(self) -> bool:
+        """Requests the oldest waiting registration, or leaves it out. Returns whether it could: a result that counts
+        before it may be missing, or the budget refuses it until the streams have gone on."""
         if not self._sweep_sets or self._tried_ns == self._sampler.latest_ns:
             return False
-        stamp_ns = self._sweep_sets[0].stamp_ns
-        return all(pending.rests is not None for pending in self._pending if pending.due_ns <= stamp_ns)
-
-    def choose_next(self) -> bool:
-        """Asks for the oldest waiting look, or leaves it out. Returns False if it still waits."""
-        if not self.may_choose():
-            return False
         sweep_set = self._sweep_sets[0]
-        while self._pending and self._pending[0].due_ns <= sweep_set.stamp_ns:
-            self._resting = self._pending.popleft().rests or 0
+        if self._schedule.waits(sweep_set.stamp_ns):
+            return False
+        for rests in self._schedule.take_due(sweep_set.stamp_ns):
+            self._resting = rests
         if self._resting:
             self._resting -= 1
             self._losses["rested"] += 1
-        elif self._budget.try_acquire(self._name, sweep_set.stamp_ns, suspected=False):
+        elif self._vehicle.budget.try_acquire(self._name, sweep_set.stamp_ns, suspected=False):
             self._submit(sweep_set)
         else:
             self._tried_ns = self._sampler.latest_ns
@@ -284,65 +288,63 @@ class LidarPairStream:
         return True
 
     def tick(self, *, waiting: bool) -> None:
-        """Does nothing: nothing here waits for a clock."""
+        """Nothing here waits for a clock: the worker answers every job by its deadline."""
 
     def _submit(self, sweep_set: lidar_sampling.SweepSet) -> None:
-        pending = _PendingRegistration(
-            sweep_set.stamp_ns + COUNTS_AFTER_NS, sweep_set.start_ns, sweep_set.stamp_ns, self._lost()
-        )
-        self._pending.append(pending)
-        self.unanswered += 1
-
-        def done(outcome: JobOutcome) -> None:
-            self._budget.release(self._name)
-            self._inbox.call(partial(self._answered, pending, outcome))
-
+        subject = RegistrationSubject(sweep_set.start_ns, sweep_set.stamp_ns, self._lost())
+        request = self._schedule.submit(subject, sweep_set.stamp_ns + COUNTS_AFTER_NS, inf)
+        done = partial(self._vehicle.post_outcome, self._name, request)
         self._worker.submit(worker_jobs.register(self._name, self._lidars, sweep_set.pairs, done))
 
-    # --- answers ----------------------------------------------------------------------------------------------------
+    # --- results ----------------------------------------------------------------------------------------------------
 
-    def _answered(self, pending: _PendingRegistration, outcome: JobOutcome) -> None:
-        self.unanswered -= 1
-        if pending not in self._pending:
-            return  # it was asked before sensor time stepped back
-        report, pending.rests = self._report_of(pending, outcome)
-        self._rig.put(self._name, pending.due_ns, report)
+    def on_event(self, event: object) -> None:
+        """A registration has ended."""
+        assert isinstance(event, JobDone)
+        assert isinstance(event.subject, Request)
+        self._vehicle.budget.release(self._name)
+        # One that was requested before sensor time stepped back does not count.
+        self._schedule.answer(event.subject, event.outcome)
+        while (request := self._schedule.next_answered()) is not None:
+            report, rests = self._report_of(request)
+            self._schedule.conclude(request, rests)
+            self._vehicle.rig.put(self._name, request.due_ns, report)
         if self._sampler.latest_ns is not None:
             self._report_time(self._sampler.latest_ns)
 
     def _report_time(self, now_ns: int) -> None:
-        waits = any(pending.rests is None and pending.due_ns <= now_ns for pending in self._pending)
-        self._rig.report_time(self._name, now_ns, waits=waits)
+        self._vehicle.rig.report_time(self._name, now_ns, waits=self._schedule.waits(now_ns))
 
-    def _report_of(self, pending: _PendingRegistration, outcome: JobOutcome) -> tuple[rig.LidarPairReport, int]:
-        """The outcome of a look, and how many looks are to be left out after it."""
+    def _report_of(self, request: RegistrationRequest) -> tuple[LidarPairReport, int]:
+        """The outcome of a registration, and how many are to be left out after it."""
+        subject, outcome = request.subject, request.result
+        assert outcome is not None
         answer = outcome.answer
         if not isinstance(answer, Registered):
             reasons = () if outcome.reason is None else (outcome.reason,)
-            return rig.LidarPairReport(pending.stamp_ns, None, reasons, pending.losses), 0
+            return LidarPairReport(subject.stamp_ns, None, reasons, subject.losses), 0
         if answer.reasons:
             rests = RESTS if answer.share < lidar_sampling.LEAST_SHARE else 0
-            return rig.LidarPairReport(pending.stamp_ns, None, answer.reasons, pending.losses), rests
+            return LidarPairReport(subject.stamp_ns, None, answer.reasons, subject.losses), rests
         covariance = determined_covariance(answer.covariance)
         if covariance is None:
-            return rig.LidarPairReport(pending.stamp_ns, None, (WEAK,), pending.losses), 0
-        registration = rig.Registration(
-            observation_of_registration(self._name, pending.stamp_ns, answer.T_a_b, covariance),
-            EdgeWindow(window_of(pending.stamp_ns, answer.T_a_b, covariance), pending.start_ns),
+            return LidarPairReport(subject.stamp_ns, None, (WEAK,), subject.losses), 0
+        registration = Registration(
+            observation_of_registration(self._name, subject.stamp_ns, answer.T_a_b, covariance),
+            EdgeWindow(window_of(subject.stamp_ns, answer.T_a_b, covariance), subject.start_ns),
             answer.range_bias,
             answer.rms_m,
             answer.points,
             answer.share,
         )
-        return rig.LidarPairReport(pending.stamp_ns, registration, (), pending.losses), 0
+        return LidarPairReport(subject.stamp_ns, registration, (), subject.losses), 0
 
     # --- inside -----------------------------------------------------------------------------------------------------
 
     def _begin_new_time(self) -> None:
-        """Sensor time has stepped back: drops all looks and questions, whose stamps mean nothing in the new time."""
-        self._losses["time_stepped_back"] += len(self._pending) + len(self._sweep_sets)
+        """Sensor time has stepped back: drops all sweeps and requests, whose stamps mean nothing in the new time."""
+        self._losses["time_stepped_back"] += self._schedule.withdraw() + len(self._sweep_sets)
         self._sweep_sets.clear()
-        self._pending.clear()
         self._resting, self._missed, self._tried_ns = 0, "", None
 
     def _lost(self) -> dict[str, int]:
@@ -353,27 +355,18 @@ class LidarPairs:
     """The edges between all LiDARs of a vehicle. For the main thread.
 
     Attributes:
-        trouble: why no LiDARs are looked at, if people can change that; else None.
+        problem: why no LiDARs are registered, if people can change that; else None.
     """
 
-    def __init__(
-        self,
-        config: LidarEdgesConfig,
-        intake: Intake,
-        worker: Worker,
-        budget: Budget,
-        rig: rig.RigEstimatorThread,
-    ) -> None:
+    def __init__(self, config: LidarEdgesConfig, vehicle: Vehicle, worker: Worker) -> None:
         self._period_s = config.period_s
-        self._intake = intake
+        self._vehicle = vehicle
         self._worker = worker
-        self._budget = budget
-        self._rig = rig
         self._names: set[str] = set()
         self.problem: Reason | None = None
 
     def grow(self, pairs: Iterable[PairConfig]) -> None:
-        """Takes all present pairs, which the rig knows already, and begins to look at every two of their LiDARs that
+        """Takes all present pairs, which the rig knows already, and begins to register every two of their LiDARs that
         are new.
 
         Raises:
@@ -385,11 +378,8 @@ class LidarPairs:
             self._names.add(lidars.edge.name)
             why_not = lidars.why_not
             if why_not is None:
-                LidarPairStream(lidars, self._period_s, self._intake, self._worker, self._budget, self._rig)
+                LidarPairStream(lidars, self._period_s, self._vehicle, self._worker)
                 continue
-            self._rig.join_lidars(
-                rig.LidarPairStatus(lidars.edge, rig.LidarState.NOT_MEASURED, (why_not,)),
-                lambda: True,
-            )
+            self._vehicle.rig.join_lidars(LidarPairStatus(lidars.edge, LidarState.NOT_MEASURED, (why_not,)))
             if why_not is NOT_INSTALLED:
                 self.problem = why_not

@@ -1,54 +1,21 @@
-"""Forms pairs from the frames of one camera and one LiDAR, gives each pair in its turn to the frame selector, and
-reports on the streams of the pair.
+"""Forms frame pairs from the frames of one camera and one LiDAR, holds them until they may be evaluated, and notices
+when the streams fall silent.
 """
 
-import time
 from collections import deque
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import TypeVar
+from collections.abc import Mapping
 
 from coec.calibration.frames.pairing import Pairer
-from coec.calibration.frames.window import CarriedOverPairs
 from coec.calibration.types import FramePair, Matrix4
 from coec.config import Config, PairConfig
 from coec.io.logs import LossCounter
-from coec.service.engine.frame_selector import FrameSelector, SelectionStatistics, ServedExtrinsic
-from coec.service.engine.vehicle import Arrivals, Intake, SensorStream
-from coec.service.ingest.decoder import LIDAR, Frame, StreamCounts
+from coec.service.engine.messages import SelectionStatistics, StreamStatistics
+from coec.service.engine.vehicle import Vehicle
+from coec.service.ingest.decoder import LIDAR, Frame
 from coec.service.ingest.frame_buffers import FrameRing, PairBuffer
-from coec.service.task_queue import DeferredCall
+from coec.service.ingest.inbox import Arrivals
+from coec.service.ingest.sensor_stream import SensorStream
 from coec.service.timing import NS_PER_S, QUICK_S, Histogram, SensorClock
-
-
-@dataclass(frozen=True, slots=True)
-class StreamStatistics:
-    """Counters since the start, and the latest figures.
-
-    Attributes:
-        streams: samples and frames, by stream.
-        unpaired: number of frames that got into no pair, by `<stream>_<cause>`.
-        pairs: number of pairs that were formed.
-        held: how many of these pairs wait to be looked at.
-        chosen: what was chosen from the others.
-        rate_hz: pairs per second of sensor time; 0 when the streams have stopped, None before the second pair.
-        pace: seconds of sensor time per second; None before the second pair.
-        sync_error_s: how much later than its sweep the latest camera frame was taken.
-        timed_by: how the times of the latest sweep's points were read, see `LidarFrame`.
-    """
-
-    streams: dict[str, StreamCounts] = field(default_factory=dict)
-    unpaired: dict[str, int] = field(default_factory=dict)
-    pairs: int = 0
-    held: int = 0
-    selection: SelectionStatistics = field(default_factory=SelectionStatistics)
-    rate_hz: float | None = None
-    pace: float | None = None
-    sync_error_s: float | None = None
-    timed_by: str = ""
-
-
-T = TypeVar("T")
 
 GRACE_NS = NS_PER_S
 """Sensor time that must pass after the end of a slice before silence ends it, ns: late pairs may still be on their
@@ -60,35 +27,27 @@ meanwhile need another tick to arrive here."""
 
 
 class PairStream:
-    """Takes the frames of one camera-LiDAR pair, on the intake's thread. `ask`, `call`, `arrivals` and `losses` are for
-    any thread. `report` is the intake thread's latest report on the pair.
+    """Takes the frames of one camera-LiDAR pair. `arrivals`, `losses` and `report` are for any thread, everything else
+    is for that of the engine.
 
     Attributes:
         sensors: the streams, by kind; other pairs may share them.
-        waiting_took: how long each pair waited from when it was certain until it was looked at.
+        report: the latest statistics.
+        waiting_took: how long each frame pair waited from when it was certain until it was evaluated.
+        held: frame pairs that wait to be evaluated.
     """
 
     def __init__(
-        self,
-        pair: PairConfig,
-        config: Config,
-        intake: Intake,
-        selector: FrameSelector,
-        has_room: Callable[[], bool],
-        losses: LossCounter,
-        ring: FrameRing | None = None,
+        self, pair: PairConfig, config: Config, vehicle: Vehicle, losses: LossCounter, ring: FrameRing | None = None
     ) -> None:
-        """`has_room()` says whether the recorder would take a chosen pair now. `losses` counts those of this pair.
-        `ring` keeps the last seconds, if they are wanted."""
-        self._intake = intake
-        self.sensors: Mapping[str, SensorStream] = intake.sensors_of(pair)
+        """`losses` counts those of this pair. `ring` keeps the last seconds, if they are wanted."""
+        self.sensors: Mapping[str, SensorStream] = vehicle.sensors_of(pair)
         self.report = StreamStatistics()
         self.waiting_took = Histogram(QUICK_S)
-        self._selector = selector
-        self._has_room = has_room
+        self.held = PairBuffer(vehicle.waiting_frames, config.worker.timeout_s)
+        self._vehicle = vehicle
         self._pairer = Pairer(pair.pairing, expects_motion=pair.ego is not None)
         self._clock = SensorClock()
-        self._held = PairBuffer(intake.waiting_frames, config.worker.timeout_s)
         self._received_s: deque[float] = deque()
         self._losses = losses
         self._ring = ring
@@ -96,7 +55,6 @@ class PairStream:
         self._sync_error_s: float | None = None
         self._quiet_ticks = 0
         self._silence: tuple[int, int] | None = None
-        intake.join(self)
 
     def losses(self) -> dict[tuple[str, str], int]:
         """Losses of the pair and of its streams, by place and cause."""
@@ -107,132 +65,73 @@ class PairStream:
 
     def arrivals(self) -> dict[str, Arrivals]:
         """What came on its streams, by kind."""
-        return self._intake.arrivals(self.sensors)
+        return self._vehicle.arrivals(self.sensors)
 
-    def call_and_wait(self, work: Callable[[], T], timeout_s: float) -> T:
-        """Has `work` done between two samples, after every pair that has come was looked at, and waits for its result.
+    # --- frames -----------------------------------------------------------------------------------------------------
 
-        Raises:
-            BusyError: the work was not begun within `timeout_s`, and nothing was done; or it has not ended.
-        """
-
-        def everything_first() -> T:
-            self.finish_pairs()
-            return work()
-
-        handed = DeferredCall(everything_first)
-        self._intake.inbox.call(handed.run)
-        return handed.result(timeout_s)
-
-    def call(self, effect: Callable[[], None]) -> None:
-        """Has the effect of a decision run on the intake's thread, between two samples."""
-        self._intake.inbox.call(effect)
-
-    def adopt(self, served: ServedExtrinsic) -> None:
-        """See `Chooser`; on this thread."""
-        self._selector.adopt(served)
-
-    def alarm(self, since_ns: int) -> None:
-        """See `Chooser`; on this thread."""
-        self._selector.alarm(since_ns)
-
-    def carry_over(self, carried_over: CarriedOverPairs) -> None:
-        """See `Chooser`; on this thread."""
-        self._selector.carry_over(carried_over)
-
-    def calm(self) -> None:
-        """See `Chooser`; on this thread."""
-        self._selector.calm()
-
-    def event(self, name: str, T_camera_lidar: Matrix4) -> None:
-        """See `FrameRing`; on this thread."""
+    def push(self, frame: Frame) -> None:
+        """Takes the next frame of one of the streams; each frame says of which."""
+        self._quiet_ticks = 0
         if self._ring is not None:
-            self._ring.event(name, T_camera_lidar)
+            self._ring.push(frame, self._vehicle.clock.monotonic_s())
+        self._check_silence(frame.stamp_ns)
+        self.hold(self._pairer.push(frame), set_clock=True)
+
+    def hold(self, pairs: list[FramePair], *, set_clock: bool) -> None:
+        """New frame pairs wait for their turn. `set_clock`: their stamps tell the sensor time now."""
+        now_s = self._vehicle.clock.monotonic_s()
+        for pair in pairs:
+            if set_clock:
+                self._clock.observe(pair.stamp_ns, now_s)
+            self._received_s.append(now_s)
+            self._pairs += 1
+            self._sync_error_s = (pair.camera.stamp_ns - pair.lidar.stamp_ns) / NS_PER_S
+            self.held.add(pair)
+
+    def take(self) -> FramePair:
+        """Takes out the oldest frame pair."""
+        self.waiting_took.add(self._vehicle.clock.monotonic_s() - self._received_s.popleft())
+        return self.held.take()
+
+    def flush(self) -> None:
+        """Forms the frame pairs for which no better partner is awaited any more."""
+        self.hold(self._pairer.flush(), set_clock=False)
+
+    # --- the seconds around an event --------------------------------------------------------------------------------
+
+    def keep_snippet(self, event: str, T_camera_lidar: Matrix4) -> None:
+        """The seconds around an event are to be kept, if snippets are; `T_camera_lidar` (4, 4) is served then."""
+        if self._ring is not None:
+            self._ring.event(event, T_camera_lidar)
 
     def finish_snippet(self) -> None:
-        """Ends the open snippet without waiting for further frames; on this thread, or after its end."""
+        """Ends the open snippet without waiting for further frames."""
         if self._ring is not None:
             self._ring.finish()
 
-    def finish_pairs(self) -> None:
-        """Looks at every pair that has come, even if it should wait for an answer. For the thread of the intake, or
-        after its end."""
-        self._hold(self._pairer.flush())
-        while self._held:
-            self._choose()
+    # --- time -------------------------------------------------------------------------------------------------------
 
-    def taker(self, name: str) -> Callable[[Frame], None]:
-        """`push` for every stream, because each frame says what it is."""
-        del name
-        return self.push
-
-    def push(self, frame: Frame) -> None:
-        """Takes the next frame of one of the streams."""
-        self._quiet_ticks = 0
-        if self._ring is not None:
-            self._ring.push(frame, time.monotonic())
-        self._check_silence(frame.stamp_ns)
-        self.take(self._pairer.push(frame))
-
-    def take(self, pairs: list[FramePair]) -> None:
-        """Takes new pairs: their stamps tell the time, and they wait for their turn."""
-        for pair in pairs:
-            self._clock.observe(pair.stamp_ns, time.monotonic())
-        self._hold(pairs)
-
-    def _choose(self) -> None:
-        self.waiting_took.add(time.monotonic() - self._received_s.popleft())
-        self._selector.choose(self._held.take())
-
-    def _hold(self, pairs: list[FramePair]) -> None:
-        for pair in pairs:
-            self._received_s.append(time.monotonic())
-            self._pairs += 1
-            self._sync_error_s = (pair.camera.stamp_ns - pair.lidar.stamp_ns) / NS_PER_S
-            self._held.add(pair)
-
-    def choose_next(self) -> bool:
-        """Looks at the oldest waiting pair if it may be looked at; returns whether it did."""
-        if not self.may_choose():
-            return False
-        self._choose()
-        return True
-
-    def may_choose(self) -> bool:
-        """Whether a pair waits and may be looked at: everything that has to be judged before it is judged, or it has
-        waited too long, or too many frames wait."""
-        if not self._held:
-            return False
-        if self._has_room() and not self._selector.must_wait(self._held.next_ns):
-            self._held.stop_waiting()
-            return True
-        return self._held.has_waited(time.monotonic())
-
-    def tick(self, *, waiting: bool) -> None:
-        """Time has passed; `waiting`: samples of the streams are in the inbox. Ends a slice in silence, and renews the
-        report."""
+    def tick(self, selection: SelectionStatistics, *, waiting: bool) -> None:
+        """Time has passed; `waiting`: samples of the streams are in the inbox. Renews the report."""
         self._quiet_ticks = 0 if waiting else self._quiet_ticks + 1
-        if self._quiet_ticks > QUIET_TICKS:
-            self._end_in_silence()
         if self._ring is not None:
-            self._ring.tick(time.monotonic())
-        self.renew_report()
+            self._ring.tick(self._vehicle.clock.monotonic_s())
+        self.renew_report(selection)
 
-    def _end_in_silence(self) -> None:
-        """Ends the slice by extrapolated time if the streams have stopped."""
-        end_ns = self._selector.slice_end_ns
-        if end_ns is None or self._held:
-            return
-        now_ns = self._clock.silent_now_ns(time.monotonic())
-        if now_ns is None or now_ns < end_ns + GRACE_NS:
-            return
-        # The flushed pairs came earlier and are certain only by the silence, so they do not set the clock.
+    def silence_ends(self, slice_end_ns: int | None) -> bool:
+        """Whether the open slice, which ends at this sensor time, is over by extrapolated time, because the streams
+        have stopped and no frame pair waits."""
+        if slice_end_ns is None or self.held or self._quiet_ticks <= QUIET_TICKS:
+            return False
+        now_ns = self._clock.silent_now_ns(self._vehicle.clock.monotonic_s())
+        return now_ns is not None and now_ns >= slice_end_ns + GRACE_NS
+
+    def end_in_silence(self, slice_end_ns: int, last_ns: int | None) -> None:
+        """The slice is ended in silence; `last_ns` is the stamp of the last frame pair that was evaluated. Frame pairs
+        that are certain only by the silence came earlier, so they do not set the clock."""
         pairs = self._pairer.flush()
-        self._hold(pairs)
-        last_ns = pairs[-1].stamp_ns if pairs else self._selector.statistics.last_ns
-        self._silence = last_ns or 0, end_ns
-        if not self._held:
-            self._selector.end_slice_by(end_ns)
+        self.hold(pairs, set_clock=False)
+        self._silence = (pairs[-1].stamp_ns if pairs else last_ns) or 0, slice_end_ns
 
     def _check_silence(self, stamp_ns: int) -> None:
         """Checks, when a frame comes, whether a slice that ended in silence ended too early. If the frame belongs to
@@ -245,16 +144,16 @@ class PairStream:
         if last_ns < stamp_ns < end_ns:
             self._losses.add("window", "ended_too_early", detail="frames that were held up came after the slice ended")
 
-    def renew_report(self) -> None:
-        """Renews the report."""
-        silent = self._clock.is_silent(time.monotonic())
+    def renew_report(self, selection: SelectionStatistics) -> None:
+        """Renews the report, with the statistics of the selection."""
+        silent = self._clock.is_silent(self._vehicle.clock.monotonic_s())
         rate_hz = self._clock.rate_hz
         self.report = StreamStatistics(
             streams={kind: sensor.decoder.counts() for kind, sensor in self.sensors.items()},
             unpaired=dict(self._pairer.losses),
             pairs=self._pairs,
-            held=len(self._held),
-            selection=self._selector.statistics,
+            held=len(self.held),
+            selection=selection,
             rate_hz=0.0 if silent and rate_hz is not None else rate_hz,
             pace=self._clock.pace,
             sync_error_s=self._sync_error_s,

@@ -1,27 +1,22 @@
-"""The thread that puts together what the pairs of a vehicle report, and what the rig exchanges with each pair and with
-every two LiDARs. Only this thread changes what is known of the rig. Pairs hand in their reports from their own
-threads; here they are taken in one order (`schedule`). What the rig reports to a pair counts `LAG_NS` later in the
-selection of the pair's frames, and the frames wait for it. So it changes the same things at the same sensor time,
-however long it takes to compute, just like the worker's results for a pair. When a sensor was identified as moved,
-one correction for all its pairs waits for a window of each. A pair that suspects nothing itself would end its
-window minutes later, with its ordinary slice, so windows of these pairs are requested.
+"""Puts together what the pairs of a vehicle report, and what the rig exchanges with each pair and with every two
+LiDARs. Reports are taken in one order (`schedule`). What the rig reports to a pair counts `LAG_NS` later in the
+selection of the pair's frames, and the frames wait for it. So it changes the same things at the same sensor time, in
+whatever order the streams of the pairs come. When a sensor was identified as moved, one correction for all its pairs
+waits for a window of each. A pair that suspects nothing itself would end its window minutes later, with its ordinary
+slice, so windows of these pairs are requested.
 
-Pairs hand in their reports from their own threads; here they are taken in one order (`order`). What the rig tells a
-pair counts `LAG_NS` later in the choice of the pair's frames, and the frames wait for it. So it changes the same things
-at the same sensor time, however long it takes to compute, just like the worker's answers to a pair.
+Everything here belongs to the thread of the engine; only `join` and `join_lidars` are for any thread.
 """
 
 from __future__ import annotations
 
 import logging
-import threading
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from math import radians
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,8 +32,7 @@ from coec.calibration.tracker import Measurement, prior_sigma
 from coec.calibration.types import Estimate, Matrix4, Reason
 from coec.config import LinkConfig, PairConfig
 from coec.io.disk_writer import DiskWriter
-from coec.io.system import ServiceThread
-from coec.service.engine import schedule
+from coec.service.engine.schedule import NEVER_NS, ReportSchedule
 from coec.service.recording.window_store import start_ns_of
 from coec.service.records.rig_store import RigStore
 from coec.service.timing import NS_PER_S
@@ -127,37 +121,13 @@ class PairCorrection:
     text: str
 
 
-class RigReports(Protocol):
-    """The rig; see `keeper`."""
-
-    def put(self, pair: str, due_ns: int | None, report: PairReport) -> None:
-        """Takes in a report of a pair that counts from a sensor time on (None: from now on)."""
-
-    def report_time(self, pair: str, stamp_ns: int, *, waits: bool) -> bool:
-        """A pair has frames of this sensor time. If it `waits`, answers to its own questions are missing; else it has
-        made all its reports up to there. Returns whether the rig may still tell it something that counts by then."""
-
-    def step_back(self, pair: str, stamp_ns: int) -> None:
-        """Sensor time has stepped back for a pair, to this stamp."""
-
-    def corrections(self, pair: str, stamp_ns: int) -> list[PairCorrection]:
-        """Corrections of a pair that count from this sensor time or an earlier one; each is returned once."""
-
-    def pop_window_request(self, pair: str, stamp_ns: int) -> int | None:
-        """Sensor time since which the rig wants pairs of frames for a window, if the wish counts by `stamp_ns`;
-        returned once."""
-
-
 class RigMember:
-    """One pair of the rig. The thread that decides about the pair makes its reports; the thread of its stream takes
-    what the rig tells it."""
+    """One pair of the rig: what it reports, and what the rig reports to it."""
 
-    def __init__(self, pair: PairConfig, rig: RigReports) -> None:
+    def __init__(self, pair: PairConfig, rig: RigEstimator) -> None:
         self._name = pair.name
         self._prior = prior_sigma(pair.tracker)
         self._rig = rig
-
-    # --- on the thread that decides ---------------------------------------------------------------------------------
 
     def on_check(self, due_ns: int, before: PairState, after: PairState, observation: Observation) -> None:
         """A check of the extrinsic that was served `before` was completed."""
@@ -178,29 +148,27 @@ class RigMember:
         """Another extrinsic is served from now on."""
         self._rig.put(self._name, due_ns, served_by(state, self._prior))
 
-    # --- on the thread of the stream --------------------------------------------------------------------------------
+    def report_time(self, stamp_ns: int, *, waits: bool) -> None:
+        """The pair has frames of this sensor time. If it `waits`, results of its own requests are missing; else it has
+        made all its reports up to there."""
+        self._rig.report_time(self._name, stamp_ns, waits=waits)
 
-    def must_wait(self, stamp_ns: int, *, for_own: bool) -> bool:
-        """Whether the rig may still tell something that counts before a pair of frames of this stamp is looked at.
-        `for_own`: the pair waits for answers to its own questions anyway."""
-        return self._rig.report_time(self._name, stamp_ns, waits=for_own)
+    def waits(self, stamp_ns: int) -> bool:
+        """Whether the rig may still report something that counts before a frame pair of this stamp is evaluated."""
+        return self._rig.waits(stamp_ns)
 
     def corrections(self, stamp_ns: int) -> list[PairCorrection]:
-        """Corrections that count before a pair of frames of this stamp is looked at; each is returned once."""
+        """Corrections that count before a frame pair of this stamp is evaluated; each is returned once."""
         return self._rig.corrections(self._name, stamp_ns)
 
     def pop_window_request(self, stamp_ns: int) -> int | None:
-        """Sensor time since which the rig wants pairs of frames for a window, asked before a pair of this stamp is
-        looked at; returned once. None: it wants no window."""
+        """Sensor time since which the rig wants frame pairs for a window, before a pair of this stamp is evaluated;
+        returned once. None: it wants no window."""
         return self._rig.pop_window_request(self._name, stamp_ns)
 
     def time_stepped_back(self, stamp_ns: int) -> None:
         """The clock of the sensors has stepped back, to this stamp."""
-        self._rig.step_back(self._name, stamp_ns)
-
-
-JoinRig = Callable[[PairConfig, PairState], RigMember]
-"""Adds a pair to the rig, with what it serves at its start."""
+        self._rig.step_back(stamp_ns)
 
 
 def served_by(state: PairState, prior: NDArray[np.float64]) -> ServedEdge:
@@ -303,10 +271,8 @@ LAG_NS = 15 * NS_PER_S
 worker so long that the pair is this far behind another, it holds the other up."""
 
 QUIET_TICKS = 4
-"""Ticks without a frame of any pair after which, once every question is answered, all reports are taken: nothing
-earlier can come. Ticks are counted instead of seconds, because a process that slept has samples to take first."""
-
-TICK_S = 1.0
+"""Ticks without a frame of any pair after which, once every request is answered, all reports are taken: nothing earlier
+can come. Ticks are counted instead of seconds, because a process that slept has samples to take first."""
 
 MOST_CORRECTIONS = 4
 """How many corrections of one pair may wait for its frames. If a pair has no frames, the newest ones stay."""
@@ -355,157 +321,136 @@ class _Joined:
     window: EdgeWindow | None
 
 
-class RigEstimatorThread:
-    """The rig of one vehicle. `put`, `at`, `step_back`, `corrections`, `window_wanted`, `join` and `join_lidars` are
-    for any thread; everything else belongs to `thread`."""
+class RigEstimator:
+    """The rig of one vehicle.
+
+    Attributes:
+        snapshot: what is known; replaced whenever it has changed, and never changed itself.
+    """
 
     def __init__(self, folder: Path, links: Sequence[LinkConfig], disk_writer: DiskWriter) -> None:
-        """Call `listen` before the first report."""
-        self.thread = ServiceThread("rig", self._run)
         self._links = tuple(links)
         self._disk_writer = disk_writer
         self._file = RigStore(folder)
         disk_writer.register(self._file)
-        self._condition = threading.Condition()
-        self._schedule: schedule.ReportSchedule[
-            PairReport | LidarPairReport | LidarPairStatus | _Joined | _SteppedBack
-        ] = schedule.ReportSchedule()
+        self._schedule: ReportSchedule[PairReport | LidarPairReport | LidarPairStatus | _Joined | _SteppedBack] = (
+            ReportSchedule()
+        )
+        self._joining: deque[tuple[str, _Joined | LidarPairStatus]] = deque()
         self._corrections: dict[str, deque[PairCorrection]] = {}
         self._window_requests: dict[str, WindowRequest] = {}
         self._pairs: dict[str, _Joined] = {}
         self._lidars: dict[str, LidarPairStatus] = {}
-        self._have_all_answers: list[Callable[[], bool]] = []
-        self._count = 0
+        self._members = 0
         self._quiet_ticks = 0
         self._rig: VehicleRig | None = None
         self._graph: RigGraph | None = None
         self._why: tuple[Reason, ...] = ()
         self._from_ns: int | None = None
         self._losses: Counter[str] = Counter({"state_damaged": len(self._file.damage)} if self._file.damage else {})
-        self._saved_ns = schedule.NEVER_NS
-        self._on_update: Callable[[RigSnapshot], None] = lambda _: None
-        self._wake: Callable[[], None] = lambda: None
-
-    def connect(self, on_update: Callable[[RigSnapshot], None], wake: Callable[[], None]) -> None:
-        """Sets two callbacks. `tell` is called with what is known: now, and whenever it has changed. `wake` is called
-        when frames that wait for the rig may be looked at."""
-        self._on_update, self._wake = on_update, wake
-        self._publish()
+        self._saved_ns = NEVER_NS
+        self.snapshot = RigSnapshot(losses=dict(self._losses))
 
     # --- on any thread ----------------------------------------------------------------------------------------------
 
-    def join(
-        self, pair: PairConfig, nominal: Matrix4, state: PairState, has_all_answers: Callable[[], bool]
-    ) -> RigMember:
-        """Adds a pair to the rig: with its nominal calibration (4, 4) and its state at the start. `has_all_answers`
-        says whether all its questions are answered."""
+    def join(self, pair: PairConfig, nominal: Matrix4, state: PairState) -> RigMember:
+        """Adds a pair to the rig: with its nominal calibration (4, 4) and its state at the start."""
         accepted = state.accepted
         window = (
             None
             if accepted is None
             else EdgeWindow(Measurement.from_estimate(accepted), start_ns_of(accepted.window_id))
         )
-        serves = served_by(state, prior_sigma(pair.tracker))
-        joined = _Joined(pair, nominal, serves, window)
-        with self._condition:
-            self._count += 1
-            self._have_all_answers.append(has_all_answers)
-            self._schedule.put(pair.name, None, joined)
-            self._condition.notify_all()
+        self._joining.append((pair.name, _Joined(pair, nominal, served_by(state, prior_sigma(pair.tracker)), window)))
         return RigMember(pair, self)
 
-    def join_lidars(self, known: LidarPairStatus, has_all_answers: Callable[[], bool]) -> None:
-        """Adds two LiDARs of pairs that have joined, whether they are looked at or not. The name of their edge stands
-        for them. The edge belongs to the rig once a look has measured it."""
-        with self._condition:
-            self._have_all_answers.append(has_all_answers)
-            self._schedule.put(known.edge.name, None, known)
-            self._condition.notify_all()
+    def join_lidars(self, known: LidarPairStatus) -> None:
+        """Adds two LiDARs of pairs that have joined, whether they are registered or not. The name of their edge stands
+        for them. The edge belongs to the rig once a registration has measured it."""
+        self._joining.append((known.edge.name, known))
+
+    # --- reports ----------------------------------------------------------------------------------------------------
 
     def put(self, pair: str, due_ns: int | None, report: PairReport | LidarPairReport) -> None:
-        """See `pair_side.Keeps`."""
-        with self._condition:
-            if self._count < 2:
-                if isinstance(report, EdgeObservation):
-                    return
-                due_ns = None  # there is no other pair whose report it could overtake
-            self._schedule.put(pair, due_ns, report)
-            if self._schedule.is_ready:
-                self._condition.notify_all()
+        """Takes in a report of a pair that counts from a sensor time on (None: from now on)."""
+        self._admit()
+        if self._members < 2:
+            if isinstance(report, EdgeObservation):
+                return
+            due_ns = None  # there is no other pair whose report it could overtake
+        self._schedule.put(pair, due_ns, report)
 
-    def report_time(self, pair: str, stamp_ns: int, *, waits: bool) -> bool:
-        """See `pair_side.Keeps`."""
-        with self._condition:
-            if self._count < 2:
-                return False
+    def report_time(self, pair: str, stamp_ns: int, *, waits: bool) -> None:
+        """A pair has frames of this sensor time. If it `waits`, results of its own requests are missing; else it has
+        made all its reports up to there."""
+        self._admit()
+        if self._members >= 2:
             self._quiet_ticks = 0
             self._schedule.report_time(pair, stamp_ns, waits=waits)
-            if self._schedule.is_ready:
-                self._condition.notify_all()
-            return self._schedule.taken_ns < stamp_ns - LAG_NS
 
-    def step_back(self, pair: str, stamp_ns: int) -> None:
-        """See `pair_side.Keeps`."""
-        del pair
-        with self._condition:
-            if self._count < 2:
-                return
-            self._schedule.step_back(stamp_ns, _SteppedBack())
-            for waiting in self._corrections.values():
-                waiting.clear()
-            self._window_requests.clear()
-            self._condition.notify_all()
+    def waits(self, stamp_ns: int) -> bool:
+        """Whether the rig may still report something that counts by this sensor time."""
+        return self._members >= 2 and self._schedule.taken_ns < stamp_ns - LAG_NS
+
+    def step_back(self, stamp_ns: int) -> None:
+        """Sensor time has stepped back for a pair, to this stamp."""
+        if self._members < 2:
+            return
+        self._schedule.step_back(stamp_ns, _SteppedBack())
+        for waiting in self._corrections.values():
+            waiting.clear()
+        self._window_requests.clear()
 
     def corrections(self, pair: str, stamp_ns: int) -> list[PairCorrection]:
-        """See `pair_side.Keeps`."""
-        with self._condition:
-            waiting = self._corrections.get(pair)
-            due = []
-            while waiting and waiting[0].from_ns <= stamp_ns:
-                due.append(waiting.popleft())
-            return due
+        """Corrections of a pair that count from this sensor time or an earlier one; each is returned once."""
+        waiting = self._corrections.get(pair)
+        due = []
+        while waiting and waiting[0].from_ns <= stamp_ns:
+            due.append(waiting.popleft())
+        return due
 
     def pop_window_request(self, pair: str, stamp_ns: int) -> int | None:
-        """See `pair_side.Keeps`."""
-        with self._condition:
-            request = self._window_requests.get(pair)
-            if request is None or request.from_ns > stamp_ns:
-                return None
-            del self._window_requests[pair]
-            return request.since_ns
+        """Sensor time since which the rig wants frame pairs for a window, if that counts by `stamp_ns`; returned
+        once."""
+        request = self._window_requests.get(pair)
+        if request is None or request.from_ns > stamp_ns:
+            return None
+        del self._window_requests[pair]
+        return request.since_ns
 
-    def request_stop(self) -> None:
-        """Has the thread take what was reported, and end."""
-        self.thread.request_stop()
-        with self._condition:
-            self._condition.notify_all()
+    # --- turns of the engine ----------------------------------------------------------------------------------------
 
-    # --- the thread -------------------------------------------------------------------------------------------------
+    def tick(self) -> None:
+        """A second has passed."""
+        self._quiet_ticks += 1
 
-    def _run(self, thread: ServiceThread) -> None:
-        while not thread.stopping:
-            thread.beat()
-            self.work(TICK_S)
-        self.finish()
+    @property
+    def is_quiet(self) -> bool:
+        """Whether no pair has had a frame for `QUIET_TICKS`."""
+        return self._quiet_ticks >= QUIET_TICKS
+
+    def take_report(self, *, all_are_silent: bool = False) -> bool:
+        """Takes the next report; returns whether one could be taken. `all_are_silent`: nothing earlier can come,
+        because the streams have stopped and every request is answered."""
+        self._admit()
+        return self._take_one(silent=all_are_silent)
 
     def finish(self) -> None:
         """Takes all reports in their order, and saves what is known; for the end of the service."""
+        self._admit()
         while self._take_one(silent=True):
             pass
         self._save()
 
-    def work(self, timeout_s: float) -> bool:
-        """Takes the next report, waiting for it up to `timeout_s`; returns whether one came."""
-        with self._condition:
-            if not self._schedule.is_ready and timeout_s > 0.0 and not self._condition.wait(timeout_s):
-                self._quiet_ticks += 1
-            quiet = self._quiet_ticks >= QUIET_TICKS
-            have_all_answers = list(self._have_all_answers)
-        return self._take_one(silent=quiet and all(has() for has in have_all_answers))
+    def _admit(self) -> None:
+        """Takes in whoever has joined."""
+        while self._joining:
+            name, joined = self._joining.popleft()
+            self._members += isinstance(joined, _Joined)
+            self._schedule.put(name, None, joined)
 
     def _take_one(self, *, silent: bool) -> bool:
-        with self._condition:
-            report = self._schedule.take(all_are_silent=silent)
+        report = self._schedule.take(all_are_silent=silent)
         if report is None:
             return False
         before = self._rig
@@ -514,12 +459,10 @@ class RigEstimatorThread:
         except ValueError as error:  # unusable numbers, from an estimate that went wrong
             self._losses["refused"] += 1
             _log.warning(f"what {report.pair} reported is excluded from the rig estimate: {error}")
-        with self._condition:
-            self._notify_pairs(before, report.due_ns)
-            self._schedule.finish(report)
-        self._wake()
+        self._notify_pairs(before, report.due_ns)
+        self._schedule.finish(report)
         self._save_in_time(before, report.due_ns)
-        self._publish()
+        self.snapshot = self._snapshot()
         return True
 
     def _after(
@@ -576,14 +519,13 @@ class RigEstimatorThread:
         self._why = self._file.damage
         serves = {name: joined.serves for name, joined in self._pairs.items()}
         # LiDAR edges begin with the pose as built. A single look must not replace it: it is only one of many.
-        serves |= {edge.name: ServedEdge(edge.T_a_b, KNOWN_BEFORE, schedule.NEVER_NS) for edge in measured}
+        serves |= {edge.name: ServedEdge(edge.T_a_b, KNOWN_BEFORE, NEVER_NS) for edge in measured}
         windows = {name: joined.window for name, joined in self._pairs.items() if joined.window is not None}
         fresh = self._file.restored(rig_estimator.initial_rig(self._graph, serves, windows))
         self._rig = fresh if self._rig is None else rig_estimator.grown(self._rig, fresh)
 
     def _notify_pairs(self, before: VehicleRig | None, stamp_ns: int) -> None:
-        """Hands a new correction to its pairs, and wishes to the pairs of which a window is awaited now. Called with
-        the lock."""
+        """Hands a new correction to its pairs, and wishes to the pairs of which a window is awaited now."""
         rig = self._rig
         self._window_requests |= window_requests(before, rig, stamp_ns + LAG_NS)
         if rig is None or rig.correction is None or (before is not None and before.correction is rig.correction):
@@ -599,15 +541,14 @@ class RigEstimatorThread:
                 PairCorrection(joint_pose, stamp_ns, self._from_ns, text)
             )
 
-    # --- telling ----------------------------------------------------------------------------------------------------
+    # --- what is known ----------------------------------------------------------------------------------------------
 
-    def _publish(self) -> None:
-        with self._condition:
-            stamp_ns = self._schedule.taken_ns
-            losses = {**self._losses, **self._schedule.losses}
-        known = stamp_ns if stamp_ns > schedule.NEVER_NS // 2 else None
+    def _snapshot(self) -> RigSnapshot:
+        stamp_ns = self._schedule.taken_ns
+        known = stamp_ns if stamp_ns > NEVER_NS // 2 else None
         lidars = tuple(self._lidars[name] for name in sorted(self._lidars))
-        self._on_update(RigSnapshot(self._graph, self._rig, self._why, known, self._from_ns, lidars, losses))
+        losses = {**self._losses, **self._schedule.losses}
+        return RigSnapshot(self._graph, self._rig, self._why, known, self._from_ns, lidars, losses)
 
     def _save_in_time(self, before: VehicleRig | None, stamp_ns: int) -> None:
         rig = self._rig

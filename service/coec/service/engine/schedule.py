@@ -1,9 +1,9 @@
-"""What counts from a sensor time on: the pending results of a pair, in the order in which they were requested, and the
-reports of several pairs, put into one order whatever the order in which they arrive.
+"""What counts from a sensor time on: the results that one stream has requested, in the order of the requests, and the
+reports of several streams, put into one order whatever the order in which they arrive.
 
 How long a result takes depends on the machine, but what it changes must not. So every request gets, when it is
 submitted, a sensor time from which its result counts in the selection of further frames. The stream waits for the
-result before it evaluates a pair of that time. A replay of a drive is therefore evaluated in the same way, at any rate
+result before it evaluates frames of that time. A replay of a drive is therefore evaluated in the same way, at any rate
 and on any machine. Results are served the moment they come; only the stream waits.
 
 Every request ends: with its result, or when it has waited longer than a result may take, so that a lost one does not
@@ -12,125 +12,114 @@ hold up those behind it.
 Every report of a pair to the rig has such a time, too. A pair that has come to some sensor time has made all its
 reports that count up to there. Reports up to the time that all pairs have passed are taken, in the order of these
 times; for equal times, in the order of the pairs' names. The order does not wait for a pair whose streams have stopped.
+
+Both belong to the thread of the engine.
 """
 
 import heapq
-import threading
 from collections import Counter, deque
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Generic, TypeVar
 
 from coec.service.timing import NS_PER_S
 
-Effect = Callable[[], None]
-"""Applies what an answer changes in the choice of further pairs; run by the thread that chooses them."""
-
-TakeResult = Callable[[], Effect | None]
-"""Takes an answer and returns its effect; run by the thread that decides."""
+Subject = TypeVar("Subject")
+Result = TypeVar("Result")
+Change = TypeVar("Change")
 
 
 @dataclass(slots=True, eq=False)
-class PendingRequest:
-    """One question.
+class Request(Generic[Subject, Result, Change]):
+    """One request.
 
     Attributes:
-        due_ns: sensor time from which pairs are looked at only once the answer is known.
-        expires_s: time after which the answer is no longer awaited, by the steady clock less what does not count.
-        name: id of the window that the question is about; empty for a check.
-        take: takes the answer; None until it has come.
-        effect: effect of the answer, once it was taken.
+        subject: what was requested.
+        due_ns: sensor time from which frames are evaluated only once the result is known.
+        expires_s: time after which the result is no longer awaited, by the clock of the caller.
+        result: the result; None until it has come.
+        change: what the result changes in the selection of frames, once it was concluded.
     """
 
+    subject: Subject
     due_ns: int
     expires_s: float
-    name: str = ""
-    take: TakeResult | None = None
-    effect: Effect | None = None
-    taken: bool = False
+    result: Result | None = None
+    change: Change | None = None
 
 
-class ResultSchedule:
-    """The questions of one pair. One thread asks and lets answers take effect, one thread answers."""
+class Schedule(Generic[Subject, Result, Change]):
+    """The requests of one stream: submit, answer, conclude in the order of submission, apply when due."""
 
-    def __init__(self, paused_s: Callable[[], float] = lambda: 0.0) -> None:
-        """`paused_s()`: time so far that does not count as waiting, s: that in which the worker compiled kernels."""
-        self._paused_s = paused_s
-        self._lock = threading.Lock()
-        self._pending: deque[PendingRequest] = deque()
-        self._untaken: deque[PendingRequest] = deque()
+    def __init__(self) -> None:
+        self._concluded: deque[Request[Subject, Result, Change]] = deque()
+        self._open: deque[Request[Subject, Result, Change]] = deque()
 
-    def submit(self, due_ns: int, expires_s: float, name: str = "") -> PendingRequest:
-        """Asks a question. It is due no earlier than those before it, because its answer has to wait for theirs."""
-        with self._lock:
-            before_ns = self._pending[-1].due_ns if self._pending else due_ns
-            request = PendingRequest(max(due_ns, before_ns), expires_s - self._paused_s(), name)
-            self._pending.append(request)
-            self._untaken.append(request)
-            return request
+    def submit(self, subject: Subject, due_ns: int, expires_s: float) -> Request[Subject, Result, Change]:
+        """Adds a request. It is due no earlier than those before it, because its result waits for theirs."""
+        last = self._open[-1] if self._open else self._concluded[-1] if self._concluded else None
+        request = Request[Subject, Result, Change](
+            subject, due_ns if last is None else max(due_ns, last.due_ns), expires_s
+        )
+        self._open.append(request)
+        return request
 
-    def about(self, name: str) -> PendingRequest | None:
-        """The unanswered question about a window; None if there is none."""
-        with self._lock:
-            return next((one for one in self._untaken if one.name == name and one.take is None), None)
+    def unanswered_about(self, subject: Subject) -> Request[Subject, Result, Change] | None:
+        """The request about a subject that has no result yet; None if there is none."""
+        return next((one for one in self._open if one.result is None and one.subject == subject), None)
 
-    def answer(self, request: PendingRequest, take: TakeResult) -> None:
-        """The answer to a question has come. It is taken as soon as all those in front are. A second answer to the same
-        question is ignored."""
-        if request.take is None:
-            request.take = take
-        self._take_answered()
+    def answer(self, request: Request[Subject, Result, Change], result: Result) -> bool:
+        """The result of a request has come. Returns whether it counts: a second result, or one of a request that was
+        withdrawn, does not."""
+        if request.result is not None or request not in self._open:
+            return False
+        request.result = result
+        return True
 
-    def expire(self, monotonic_s: float, lost: Callable[[PendingRequest], TakeResult]) -> int:
-        """Gives up questions that have waited too long; `lost(question)` stands in for the answer. Returns how many
-        there were."""
-        counted_s = monotonic_s - self._paused_s()
-        with self._lock:
-            late = [one for one in self._untaken if one.take is None and one.expires_s <= counted_s]
-        for request in late:
-            request.take = lost(request)
-        if late:
-            self._take_answered()
-        return len(late)
+    def next_answered(self) -> Request[Subject, Result, Change] | None:
+        """The request whose result is to be concluded next: the oldest one that is open, if its result has come."""
+        return self._open[0] if self._open and self._open[0].result is not None else None
+
+    def conclude(self, request: Request[Subject, Result, Change], change: Change | None) -> None:
+        """What the result of `next_answered` changes is known."""
+        self._open.popleft()
+        request.change = change
+        self._concluded.append(request)
+
+    def expired(self, now_s: float) -> list[Request[Subject, Result, Change]]:
+        """Requests without a result that have waited too long; each is to be answered with a failure."""
+        return [one for one in self._open if one.result is None and one.expires_s <= now_s]
 
     @property
     def unanswered(self) -> int:
-        """Number of questions whose answer has not come, or waits for one in front of it. For any thread."""
-        return len(self._untaken)
+        """Number of requests that are not concluded."""
+        return len(self._open)
 
     def waits(self, stamp_ns: int) -> bool:
-        """Whether an answer has yet to come before a pair of this sensor time is looked at."""
-        with self._lock:
-            return bool(self._untaken) and self._untaken[0].due_ns <= stamp_ns
+        """Whether a result has yet to come before frames of this sensor time are evaluated."""
+        return bool(self._open) and self._open[0].due_ns <= stamp_ns
 
-    def settle(self, stamp_ns: int) -> None:
-        """A pair of this sensor time is about to be looked at: the answers that are due take effect."""
-        with self._lock:
-            due = []
-            while self._pending and self._pending[0].taken and self._pending[0].due_ns <= stamp_ns:
-                due.append(self._pending.popleft())
-        for request in due:
-            if request.effect is not None:
-                request.effect()
+    def take_due(self, stamp_ns: int) -> list[Change]:
+        """Frames of this sensor time are about to be evaluated: removes and returns the changes that are due, in
+        order."""
+        due = []
+        while self._concluded and self._concluded[0].due_ns <= stamp_ns:
+            change = self._concluded.popleft().change
+            if change is not None:
+                due.append(change)
+        return due
 
     def bring_forward(self, stamp_ns: int) -> None:
-        """Sensor time has stepped back to this stamp: makes all outstanding answers due with the first pair of the new
-        time."""
-        with self._lock:
-            for request in self._pending:
-                request.due_ns = min(request.due_ns, stamp_ns)
+        """Sensor time has stepped back to this stamp: makes all outstanding results due with the first frames of the
+        new time."""
+        for request in (*self._concluded, *self._open):
+            request.due_ns = min(request.due_ns, stamp_ns)
 
-    def _take_answered(self) -> None:
-        while True:
-            with self._lock:
-                first = self._untaken[0] if self._untaken else None
-                if first is None or first.take is None:
-                    return
-            # Taken outside the lock, so that the stream may ask meanwhile. Only the thread that answers takes.
-            first.effect = first.take()
-            with self._lock:
-                self._untaken.popleft()
-                first.taken = True
+    def withdraw(self) -> int:
+        """Drops all requests, because their stamps mean nothing any more. Returns how many there were."""
+        dropped = len(self._concluded) + len(self._open)
+        self._concluded.clear()
+        self._open.clear()
+        return dropped
 
 
 T = TypeVar("T")
@@ -166,7 +155,7 @@ class _PairProgress:
 
 
 class ReportSchedule(Generic[T]):
-    """The order of the reports of one vehicle. Not safe for use from several threads at once: its owner has a lock.
+    """The order of the reports of one vehicle.
 
     Attributes:
         taken_ns: all reports that count up to here were taken.

@@ -1,365 +1,109 @@
-"""The thread that takes the samples of a vehicle, with its bounded inbox and its streams. It decodes each sample once
-to a frame and hands the frame to every camera-LiDAR pair that uses it. For each of these it gives the next pair of
-frames to the frame selector. The inbox between the network's threads and this one is bounded in number for each stream
-and in bytes for all streams together.
+"""The engine of one vehicle: takes samples and events, one after the other, and has all pairs, the registrations of
+LiDARs and the rig go on. One thread runs it in the service; tests and replays run it without any.
 
-There is one thread for all, for three reasons. Its work holds the interpreter nearly all the time, so that more threads
-would only share the same second. Frames are handed on without a lock. And every pair sees the samples in the order in
-which they came. Nothing here waits: not for the disk, not for the worker, not for another pair.
+A turn is: take the oldest event or sample; hand the event to its receiver, or decode the sample and hand the frame to
+every pair that uses the sensor; let each pair evaluate its next frame pair; let the rig take what was reported. Nothing
+here waits: not for the disk, not for the worker, not for another pair. So every pair sees the samples in the order in
+which they came, frames are handed on without a lock, and what a turn does depends on the samples and events alone.
 """
 
-import itertools
-import logging
-import threading
-import time
-from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
-from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import KnownStreamConfig, LimitsConfig, PairConfig
-from coec.io.logs import LossCounter
 from coec.io.system import ServiceThread
 from coec.io.zenoh.bus import InputSample
-from coec.service.ingest.decoder import EGO, TWO_SENDERS, Decoder, Frame
+from coec.service.cpu_budget import Budget
+from coec.service.engine.messages import JobDone, JobSubject
+from coec.service.engine.rig import RigEstimator, RigSnapshot
+from coec.service.ingest.decoder import Frame
 from coec.service.ingest.frame_buffers import FrameBudget, WaitingFrames
-from coec.service.timing import NS_PER_S, QUICK_S, Histogram
-
-
-@dataclass(frozen=True, slots=True)
-class Parcel:
-    """One sample as it came. `order` counts arrivals over all streams of the inbox."""
-
-    order: int
-    stream: str
-    sample: InputSample
-
-
-@dataclass(frozen=True, slots=True)
-class Call:
-    """Work that another thread wants done on the ingest thread, between two samples."""
-
-    run: Callable[[], None]
-
-
-@dataclass(frozen=True, slots=True)
-class Arrivals:
-    """What came on a stream: how many samples wait, and how long ago the last one came (None before the first)."""
-
-    waiting: int
-    age_s: float | None
-
-
-class _Waiting:
-    """The samples of one stream, oldest first."""
-
-    def __init__(self, depth: int) -> None:
-        self.parcels: deque[Parcel] = deque()
-        self.depth = depth
-        self.bytes = 0
-
-    def add(self, parcel: Parcel) -> None:
-        self.parcels.append(parcel)
-        self.bytes += len(parcel.sample.payload)
-
-    def take(self) -> Parcel:
-        parcel = self.parcels.popleft()
-        self.bytes -= len(parcel.sample.payload)
-        return parcel
-
-
-class Inbox:
-    """The streams of one reader. `put` takes microseconds and never blocks on the reader; one thread takes.
-
-    Surplus samples are dropped. A stream with too many samples loses its oldest. If all streams together hold too many
-    bytes, the stream that holds most loses its oldest, so that large messages on one stream push nothing out of
-    another.
-    """
-
-    def __init__(self, depths: dict[str, int], max_bytes: int, on_overrun: Callable[[Parcel], None]) -> None:
-        """
-        Args:
-            depths: by stream, how many samples may wait.
-            max_bytes: limit for all waiting samples together. The latest sample is taken whatever its size.
-            on_overrun: called with each sample that is dropped.
-        """
-        self._waiting = {stream: _Waiting(depth) for stream, depth in depths.items()}
-        self._max_bytes = max_bytes
-        self._received_s: dict[str, float] = {}
-        self._calls: deque[Call] = deque()
-        self._on_overrun = on_overrun
-        self._order = itertools.count()
-        self._condition = threading.Condition()
-
-    def put(self, stream: str, sample: InputSample) -> None:
-        """A sample came."""
-        with self._condition:
-            gone = self._make_room(stream, len(sample.payload))
-            self._waiting[stream].add(Parcel(next(self._order), stream, sample))
-            self._received_s[stream] = time.monotonic()
-            self._condition.notify()
-        for overrun in gone:
-            self._on_overrun(overrun)
-
-    def receiver(self, stream: str) -> Callable[[InputSample], None]:
-        """`put` for one stream."""
-        return partial(self.put, stream)
-
-    def open(self, stream: str, depth: int) -> None:
-        """Adds a stream, of which `depth` samples may wait."""
-        with self._condition:
-            self._waiting = {**self._waiting, stream: _Waiting(depth)}
-
-    def call(self, run: Callable[[], None]) -> None:
-        """Has the reader call `run`, before it takes the waiting samples."""
-        with self._condition:
-            self._calls.append(Call(run))
-            self._condition.notify()
-
-    def arrivals(self, monotonic_s: float) -> dict[str, Arrivals]:
-        """What came, by stream; ages are counted at this time of the steady clock."""
-        with self._condition:
-            return {
-                stream: Arrivals(
-                    len(waiting.parcels), None if received_s is None else max(monotonic_s - received_s, 0.0)
-                )
-                for stream, waiting in self._waiting.items()
-                for received_s in (self._received_s.get(stream),)
-            }
-
-    def waiting(self) -> set[str]:
-        """The streams that have waiting samples."""
-        with self._condition:
-            return {stream for stream, waiting in self._waiting.items() if waiting.parcels}
-
-    def wake(self) -> None:
-        """Let a waiting `take` return."""
-        with self._condition:
-            self._condition.notify()
-
-    def take(self, timeout_s: float) -> Parcel | Call | None:
-        """The next call, else the oldest sample; None if nothing came within `timeout_s`, or after `wake`."""
-        with self._condition:
-            taken = self._pop()
-            if taken is None:
-                self._condition.wait(timeout_s)
-                taken = self._pop()
-            return taken
-
-    def _make_room(self, stream: str, size: int) -> list[Parcel]:
-        """Takes out the samples that have to make room for a new one of `size` bytes."""
-        gone = []
-        own = self._waiting[stream]
-        if len(own.parcels) == own.depth:
-            gone.append(own.take())
-        while sum(waiting.bytes for waiting in self._waiting.values()) + size > self._max_bytes:
-            # The new sample counts for its stream, so that a stream with large samples makes room for them itself.
-            held = {name: waiting.bytes + size * (name == stream) for name, waiting in self._waiting.items()}
-            full = [name for name, waiting in self._waiting.items() if waiting.parcels]
-            if not full:
-                break
-            fullest = max(full, key=lambda name: held[name])
-            gone.append(self._waiting[fullest].take())
-        return gone
-
-    def _pop(self) -> Parcel | Call | None:
-        if self._calls:
-            return self._calls.popleft()
-        waiting = [waiting for waiting in self._waiting.values() if waiting.parcels]
-        return min(waiting, key=lambda one: one.parcels[0].order).take() if waiting else None
-
-
-_log = logging.getLogger(__name__)
-
-LoggedFrame = CameraFrame | LidarFrame | EgoMotion
-
-RATE_FRAMES = 30
-"""The rate is measured over the first so many frames."""
-
-SILENT_S = 5.0
-"""A stream counts as silent after so long without a frame, s."""
-
-QUIET_S = 60.0
-"""Time between two lines about the silence of one stream, s: an unsteady network must not fill the log."""
-
-
-class StreamLog:
-    """Belongs to the intake's thread."""
-
-    def __init__(self, kind: str, sensor: str, clock: Callable[[], float] = time.monotonic) -> None:
-        """`kind`: `camera`, `lidar` or `ego`. `sensor`: its name for people. `clock`: a steady clock, s."""
-        self._kind = kind
-        self._fields = {"stream": kind, "sensor": sensor}
-        self._clock = clock
-        self._frames = 0
-        self._first_ns = 0
-        self._latest_s = 0.0
-        self._reported_s = -QUIET_S
-        self._silent_since_s: float | None = None
-
-    def push(self, frame: LoggedFrame) -> None:
-        """A frame was accepted."""
-        self._latest_s = self._clock()
-        self._frames += 1
-        if self._frames == 1:
-            self._first_ns = frame.stamp_ns
-            _log.info(f"first {self._kind} frame: {_shape(frame)}", extra={"fields": self._fields})
-        elif self._frames == RATE_FRAMES and frame.stamp_ns > self._first_ns:
-            rate_hz = (RATE_FRAMES - 1) * NS_PER_S / (frame.stamp_ns - self._first_ns)
-            _log.info(f"{self._kind} frames arrive at {rate_hz:.1f} Hz by their stamps", extra={"fields": self._fields})
-        if self._silent_since_s is not None:
-            silent_s = self._latest_s - self._silent_since_s
-            self._silent_since_s = None
-            _log.info(f"{self._kind} frames arrive again after {silent_s:.0f} s", extra={"fields": self._fields})
-
-    def tick(self) -> None:
-        """Time has passed."""
-        now_s = self._clock()
-        if not self._frames or self._silent_since_s is not None or now_s - self._latest_s < SILENT_S:
-            return
-        if now_s - self._reported_s >= QUIET_S:
-            self._reported_s, self._silent_since_s = now_s, self._latest_s
-            text = f"no {self._kind} frames for {now_s - self._latest_s:.0f} s: check the sensor and the network"
-            _log.warning(text, extra={"fields": self._fields})
-
-
-def _shape(frame: LoggedFrame) -> str:
-    match frame:
-        case CameraFrame():
-            return f"{frame.image.width}×{frame.image.height}, frame {frame.frame_id!r}"
-        case LidarFrame():
-            return f"{len(frame.xyz_m)} points, frame {frame.frame_id!r}"
-        case EgoMotion():
-            return f"frame {frame.frame_id!r}"
-
-
-FRAMES_WAITING = 16
-"""Samples of a camera or a LiDAR that may wait for the ingest thread: 1.6 s at 10 Hz."""
-
-MOTIONS_WAITING = 512
-"""Ego-motion samples that may wait: 2.5 s at 200 Hz."""
-
-READ_WITHOUT = frozenset({"name", "mask", "hardware_id", "info_topic", "sweep", "T_lidar_ego"})
-"""Settings that do not change how the samples of a stream are read. Streams that differ only in these are one."""
-
-
-def read_alike(kind: str, stream: KnownStreamConfig) -> tuple[str, str]:
-    """A key that is equal for two streams if their samples give the same frames."""
-    return kind, stream.model_dump_json(exclude=set(READ_WITHOUT))
-
-
-class SensorStream:
-    """One stream. `counts` and `losses` are for any thread, everything else is for the ingest thread.
-
-    Attributes:
-        kind: what the stream brings: camera frames, LiDAR sweeps or ego-motion.
-        number: name of the stream in the inbox.
-        log: its lines in the log.
-        took: how long the decoding of each sample took.
-        takers: functions that get each frame, in the order in which the frames came.
-    """
-
-    def __init__(self, kind: str, number: str, config: KnownStreamConfig, limits: LimitsConfig) -> None:
-        self.kind = kind
-        self.number = number
-        self.config = config
-        self.losses = LossCounter(_log, config.sensor, "sensor")
-        self.decoder = Decoder(kind, config, limits, self.losses)
-        self.log = StreamLog(kind, config.sensor)
-        self.took = Histogram(QUICK_S)
-        self.takers: tuple[Callable[[Frame], None], ...] = ()
-        self._on_trial: list[Frame] = []
-
-    @property
-    def depth(self) -> int:
-        """How many samples may wait."""
-        return MOTIONS_WAITING if self.kind == EGO else FRAMES_WAITING
-
-    def take(self, sample: InputSample, budget: FrameBudget) -> None:
-        """Decodes a sample and hands the same frame to every taker. The first frames of a new sender are kept back
-        until it has sent some in a row: if the sender before comes back, two are sending, and the frames of neither may
-        be used."""
-        started_s = time.monotonic()
-        frame = self.decoder.frame(sample)
-        self.took.add(time.monotonic() - started_s, self.kind)
-        if self.decoder.contested:
-            if self._on_trial:
-                self.losses.add(self.kind, TWO_SENDERS, len(self._on_trial))
-                self._on_trial.clear()
-            return
-        if frame is None:
-            return
-        self._on_trial.append(frame)
-        if self.decoder.on_trial:
-            return
-        frames, self._on_trial = self._on_trial, []
-        for each in frames:
-            self.log.push(each)
-            if not budget.admit(each):
-                self.losses.add(self.kind, "memory_full")
-                continue
-            for taker in self.takers:
-                taker(each)
-
+from coec.service.ingest.inbox import Arrivals, Inbox, Parcel, Posted
+from coec.service.ingest.sensor_stream import SensorStream, read_alike
+from coec.service.timing import Clock
+from coec.service.worker.worker_jobs import JobOutcome
 
 ALL_FRAMES = 1.5
 """How many bytes of frames a vehicle may have in memory, as a multiple of `limits.max_held_bytes`. The additional half
 is for frames that wait for their partner, the disk or the worker: 25 pairs of 2.5 MB."""
 
 TIGHT = 1.3
-"""The same ratio, above which pairs no longer wait for an answer: to look at pairs too early is better than to refuse
-new frames. The rest up to `ALL_FRAMES` holds half a second of eight cameras and three LiDARs. Below it, 75 MB for the
-checks of one pair do no harm."""
+"""The same ratio, above which frame pairs no longer wait for a result: to evaluate them too early is better than to
+refuse new frames. The rest up to `ALL_FRAMES` holds half a second of eight cameras and three LiDARs. Below it, 75 MB
+for the checks of one pair do no harm."""
 
 TICK_S = 0.1
-"""Time between two looks at the clocks while samples come, s. The reports are read once a second."""
+"""Time between two ticks of the receivers, s. The statistics are read once a second."""
+
+RIG_TICK_S = 1.0
 
 IDLE_S = 0.25
 """Longest wait for a sample, s: so soon silence is noticed."""
 
 
-class FrameConsumer(Protocol):
-    """What the intake needs of a camera-LiDAR pair (see `pair_stream`), or of an edge between two LiDARs."""
+class Receiver(Protocol):
+    """A camera-LiDAR pair (`camera_lidar_pair`), or the registrations of two LiDARs (`lidar_pairs`)."""
+
+    @property
+    def name(self) -> str:
+        """By which events are addressed."""
 
     @property
     def sensors(self) -> Mapping[str, SensorStream]:
-        """The streams of the pair, by the names that the pair gives them."""
+        """The streams, by the names that the receiver gives them."""
+
+    @property
+    def unanswered(self) -> int:
+        """Number of requests to the worker that have no result."""
 
     def taker(self, name: str) -> Callable[[Frame], None]:
         """The function that takes the frames of one of its streams."""
 
-    def may_choose(self) -> bool:
-        """Whether a pair of frames has come that may be looked at now."""
+    def on_event(self, event: Any) -> object:
+        """Takes an event; returns the reply, if somebody waits for one."""
 
-    def choose_next(self) -> bool:
-        """Looks at the next pair of frames if that may be looked at; returns whether it did."""
+    def advance(self) -> bool:
+        """Evaluates the next frames if nothing is missing before; returns whether it did."""
 
     def tick(self, *, waiting: bool) -> None:
         """Time has passed; `waiting`: samples of its streams are in the inbox."""
 
 
-class Intake:
-    """The intake of one vehicle. `join` and `sensors_of` are for the main thread, `inbox` and `arrivals` for any.
+class Vehicle:
+    """The engine of one vehicle. `sensor`, `sensors_of`, `join` and `listen` are for the main thread, `post_outcome`,
+    `inbox` and `arrivals` for any, `turn` and `finish` for `thread`, or for a caller without threads.
 
     Attributes:
-        waiting_frames: frames of the pairs that have come and wait to be looked at.
+        waiting_frames: frames of the pairs that have come and wait to be evaluated.
     """
 
-    def __init__(self, limits: LimitsConfig, reserved_bytes: int = 0) -> None:
-        """`kept_bytes`: memory for frames that are kept in any case (for snippets), in addition to the limits."""
+    def __init__(
+        self,
+        limits: LimitsConfig,
+        budget: Budget,
+        rig: RigEstimator,
+        on_rig: Callable[[RigSnapshot], None],
+        reserved_bytes: int = 0,
+        clock: Clock | None = None,
+    ) -> None:
+        """`on_rig` is called with what is known of the rig whenever it has changed. `reserved_bytes`: memory for frames
+        that are kept in any case (for snippets), in addition to the limits."""
+        self.budget = budget
+        self.rig = rig
+        self.clock = clock or Clock()
+        self.inbox = Inbox({}, limits.max_waiting_bytes, self._overrun)
+        self.thread = ServiceThread("engine", self._run)
         self._limits = limits
+        self._on_rig = on_rig
         self._sensors: dict[tuple[str, str], SensorStream] = {}
         self._by_number: dict[str, SensorStream] = {}
         self._unsubscribed: list[SensorStream] = []
-        self.inbox = Inbox({}, limits.max_waiting_bytes, self._overrun)
-        self.thread = ServiceThread("ingest", self._run)
-        budget = self._budget = FrameBudget(reserved_bytes + round(ALL_FRAMES * limits.max_held_bytes))
+        frames = self._frames = FrameBudget(reserved_bytes + round(ALL_FRAMES * limits.max_held_bytes))
         tight = reserved_bytes + round(TIGHT * limits.max_held_bytes)
-        self.waiting_frames = WaitingFrames(limits.max_held_bytes, lambda: budget.bytes > tight)
-        self._pairs: list[FrameConsumer] = []
-        self._ticked_s = 0.0
+        self.waiting_frames = WaitingFrames(limits.max_held_bytes, lambda: frames.bytes > tight)
+        self._receivers: dict[str, Receiver] = {}
+        self._is_busy = True
+        self._ticked_s = self._rig_ticked_s = 0.0
 
     def request_stop(self) -> None:
         """End the thread."""
@@ -388,9 +132,9 @@ class Intake:
             self._sensors[alike] = sensor
         return self._sensors[alike]
 
-    def join(self, pair: FrameConsumer) -> None:
-        """A pair takes part from now on."""
-        self.inbox.call(lambda: self._join(pair))
+    def join(self, receiver: Receiver) -> None:
+        """A receiver takes part from now on."""
+        self.inbox.post("", receiver)
 
     def listen(self, subscribe: Callable[[KnownStreamConfig, Callable[[InputSample], None]], object]) -> None:
         """Subscribe to each stream that nobody has subscribed to yet."""
@@ -400,44 +144,81 @@ class Intake:
 
     # --- on any -----------------------------------------------------------------------------------------------------
 
+    def post_outcome(self, receiver: str, subject: JobSubject, outcome: JobOutcome) -> None:
+        """A job of the worker for a receiver has ended."""
+        self.inbox.post(receiver, JobDone(subject, outcome))
+
     def arrivals(self, sensors: Mapping[str, SensorStream]) -> dict[str, Arrivals]:
         """What came on these streams, by the names that the caller gives them."""
-        arrivals = self.inbox.arrivals(time.monotonic())
+        arrivals = self.inbox.arrivals(self.clock.monotonic_s())
         return {name: arrivals[sensor.number] for name, sensor in sensors.items()}
 
     def _overrun(self, parcel: Parcel) -> None:
         self._by_number[parcel.stream].decoder.overrun(parcel.sample)
 
-    # --- on the ingest thread ---------------------------------------------------------------------------------------
-
-    def _join(self, pair: FrameConsumer) -> None:
-        self._pairs.append(pair)
-        for name, sensor in pair.sensors.items():
-            sensor.takers = (*sensor.takers, pair.taker(name))
-
-    def turn(self, idle_s: float) -> bool:
-        """Takes the oldest sample, then looks at one pair of frames for each camera-LiDAR pair that has one. Returns
-        whether there was any work within `idle_s`."""
-        in_turn = any(pair.may_choose() for pair in self._pairs)
-        item = self.inbox.take(0.0 if in_turn else idle_s)
-        if isinstance(item, Call):
-            item.run()
-        elif item is not None:
-            self._by_number[item.stream].take(item.sample, self._budget)
-        processed = [pair.choose_next() for pair in self._pairs]
-        if time.monotonic() - self._ticked_s >= TICK_S:
-            self._tick()
-        return item is not None or any(processed)
+    # --- on the thread of the engine --------------------------------------------------------------------------------
 
     def _run(self, thread: ServiceThread) -> None:
         while not thread.stopping:
             thread.beat()
             self.turn(IDLE_S)
 
-    def _tick(self) -> None:
-        self._ticked_s = time.monotonic()
+    def turn(self, idle_s: float) -> bool:
+        """Does one turn; waits up to `idle_s` if there is nothing to do. Returns whether there was."""
+        item = self.inbox.take(0.0 if self._is_busy else idle_s)
+        if isinstance(item, Parcel):
+            self._by_number[item.stream].take(item.sample, self._frames)
+        elif item is not None:
+            self._deliver(item)
+        self._is_busy = False
+        for receiver in self._receivers.values():
+            self._is_busy |= receiver.advance()
+        while self.rig.take_report(all_are_silent=self.rig.is_quiet and self.unanswered == 0):
+            self._is_busy = True
+            self._on_rig(self.rig.snapshot)
+        now_s = self.clock.monotonic_s()
+        if now_s - self._ticked_s >= TICK_S:
+            self._tick(now_s)
+        return item is not None or self._is_busy
+
+    @property
+    def unanswered(self) -> int:
+        """Number of requests to the worker that have no result."""
+        return sum(receiver.unanswered for receiver in self._receivers.values())
+
+    def _deliver(self, posted: Posted) -> None:
+        if not posted.receiver:
+            self._admit(posted.event)
+            return
+        receiver = self._receivers[posted.receiver]
+        if posted.reply is None:
+            receiver.on_event(posted.event)
+        elif posted.reply.begin():
+            try:
+                posted.reply.finish(receiver.on_event(posted.event))
+            except Exception as error:
+                posted.reply.fail(error)
+
+    def _admit(self, receiver: Receiver) -> None:
+        self._receivers[receiver.name] = receiver
+        for name, sensor in receiver.sensors.items():
+            sensor.takers = (*sensor.takers, receiver.taker(name))
+
+    def _tick(self, now_s: float) -> None:
+        self._ticked_s = now_s
+        if now_s - self._rig_ticked_s >= RIG_TICK_S:
+            self._rig_ticked_s = now_s
+            self.rig.tick()
         waiting = self.inbox.waiting()
         for sensor in self.sensors:
             sensor.log.tick()
-        for pair in self._pairs:
-            pair.tick(waiting=any(sensor.number in waiting for sensor in pair.sensors.values()))
+        for receiver in self._receivers.values():
+            receiver.tick(waiting=any(sensor.number in waiting for sensor in receiver.sensors.values()))
+
+    def finish(self) -> None:
+        """Takes all events that were posted, and all reports to the rig; for the end of the service, after that of the
+        thread. Samples that have not been decoded are left."""
+        while (posted := self.inbox.take_posted()) is not None:
+            self._deliver(posted)
+        self.rig.finish()
+        self._on_rig(self.rig.snapshot)

@@ -1,5 +1,5 @@
-"""The thread that writes windows. A failure here costs a window, never the service. In its idle time it reads windows
-that the store does not know yet, a few MB at a time, for their digests.
+"""The thread that writes the windows of all pairs. A failure here costs a window, never the service. In its idle time
+it reads windows that the store does not know yet, a few MB at a time, for their digests.
 """
 
 import contextlib
@@ -177,6 +177,23 @@ class _AddBetween:
     pair: FramePair
 
 
+@dataclass(frozen=True, slots=True)
+class WindowRecorded:
+    """A window is on the disk, and held there until the receiver of this event releases it. `live` is False for an
+    unsolved window of an earlier run."""
+
+    window_id: str
+    path: Path
+    live: bool
+
+
+@dataclass(frozen=True, slots=True)
+class WindowLost:
+    """A window has ended without being recorded."""
+
+    window_id: str
+
+
 @dataclass(slots=True)
 class _OpenWindow:
     """The window being written."""
@@ -198,8 +215,53 @@ class RecordingPlan:
     packed: bool = False
 
 
+class RecordingThread:
+    """The thread of all recorders, because one disk writes no faster for many."""
+
+    def __init__(self) -> None:
+        self.thread = ServiceThread("recorder", self._run)
+        self.condition = threading.Condition()
+        self._recorders: tuple[Recorder, ...] = ()
+
+    def join(self, recorder: "Recorder") -> None:
+        """A recorder takes part from now on."""
+        with self.condition:
+            self._recorders = (*self._recorders, recorder)
+            self.condition.notify()
+
+    def request_stop(self) -> None:
+        """Has the thread write what waits, finish or abandon the open windows, and end."""
+        self.thread.request_stop()
+        with self.condition:
+            self.condition.notify()
+
+    def _run(self, thread: ServiceThread) -> None:
+        unread = True
+        while self._work() or not thread.stopping:
+            with self.condition:
+                if not any(recorder.has_work for recorder in self._recorders) and not thread.stopping:
+                    self.condition.wait(DIGEST_PAUSE_S if unread else POLL_S)
+            unread = False
+            for recorder in self._recorders:
+                thread.beat()
+                unread |= not recorder.has_work and not thread.stopping and recorder.work_in_idle_time()
+        for recorder in self._recorders:
+            recorder.close()
+
+    def _work(self) -> bool:
+        """Has each recorder do all that waits; returns whether something did."""
+        worked = False
+        for recorder in self._recorders:
+            while recorder.work():
+                self.thread.beat()
+                worked = True
+        self.thread.beat()
+        return worked
+
+
 class Recorder:
-    """Writes the windows of one pair on a thread of its own, and completes what earlier runs left unfinished.
+    """Writes the windows of one pair, and completes what earlier runs left unfinished. `work`, `work_in_idle_time` and
+    `close` are for the thread of the recorders, the rest is for any.
 
     Attributes:
         recorded: number of windows that got to the disk.
@@ -211,38 +273,37 @@ class Recorder:
         plan: RecordingPlan,
         store: WindowStore,
         losses: LossCounter,
-        on_recorded: Callable[[str, Path, bool], None],
-        on_lost: Callable[[str], None],
+        recording: RecordingThread,
+        post: Callable[[str, WindowRecorded | WindowLost], None],
         snippets: SnippetRecorder | None = None,
     ) -> None:
-        """`on_recorded(window_id, path, live)` is called on the recorder's thread for each finished window; `live` is
-        False for unsolved windows of earlier runs. A window cannot be removed before `on_recorded` returns; if it is
-        needed for longer, hold it in the store. `on_lost(window_id)` is called for each window that ended without
-        being recorded. `snippets` are written between the pairs."""
+        """`post(pair, event)` hands over an event for each window that ended. `snippets` are written between the
+        frame pairs."""
         self._plan = plan
         self._configuration = plan.configuration
         self._store = store
         self._digests = DigestReader(store, plan.rig.pair)
         self._snippets = snippets
         self._losses = losses
-        self._on_recorded = on_recorded
-        self._on_lost = on_lost
-        self._condition = threading.Condition()
+        self._thread = recording.thread
+        self._post = post
+        self._condition = recording.condition
         self._queue: deque[_Add | _AddBetween | SliceClosed | CalibrationConfig] = deque()
         self._adds = 0
         self._betweens = 0
         self._open: _OpenWindow | None = None
         self._lost: str | None = None
         self._latest: Path | None = None
+        self._is_resumed = False
         self.recorded = 0
         self.writing_took = Histogram(QUICK_S)
         self._problem: Reason | None = None
-        self.thread = ServiceThread(f"recorder-{plan.rig.pair}", self._run)
+        recording.join(self)
 
     @property
     def problem(self) -> Reason | None:
         """Why windows cannot be recorded; None while they can."""
-        silent_s = self.thread.silence_s
+        silent_s = self._thread.silence_s
         if self._problem is None and silent_s > STUCK_S:
             text = f"The disk has not answered for {silent_s:.0f} s: no window can be recorded."
             return Reason("recording_stuck", text)
@@ -303,37 +364,40 @@ class Recorder:
             self._queue.append(closed)
             self._condition.notify()
 
-    def request_stop(self) -> None:
-        """Has the thread write what waits, finish or abandon the open window, and end."""
-        self.thread.request_stop()
+    # --- on the thread of the recorders -----------------------------------------------------------------------------
+
+    @property
+    def has_work(self) -> bool:
+        """Whether something waits to be written."""
+        return bool(self._queue) or not self._is_resumed
+
+    def work(self) -> bool:
+        """Does the oldest thing that waits; returns whether something did. The first time it completes what earlier
+        runs left."""
+        if not self._is_resumed:
+            self._is_resumed = True
+            self._resume()
         with self._condition:
-            self._condition.notify()
+            item = self._queue.popleft() if self._queue else None
+            self._adds -= isinstance(item, _Add)
+            self._betweens -= isinstance(item, _AddBetween)
+        if isinstance(item, (_Add, _AddBetween)):
+            started_s = time.monotonic()
+            self._write(item)
+            self.writing_took.add(time.monotonic() - started_s)
+        elif isinstance(item, SliceClosed):
+            self._end(item.window_id, item.carried_over)
+        elif isinstance(item, CalibrationConfig):
+            self._configuration = item
+        return item is not None
 
-    # --- on the recorder's thread -----------------------------------------------------------------------------------
+    def work_in_idle_time(self) -> bool:
+        """Writes on in a snippet, or reads on in windows that the store does not know. False: there is nothing to
+        do."""
+        return (self._snippets is not None and self._snippets.write()) or self._read()
 
-    def _run(self, thread: ServiceThread) -> None:
-        self._resume()
-        unread = True
-        while True:
-            thread.beat()
-            with self._condition:
-                if not self._queue and not thread.stopping:
-                    self._condition.wait(DIGEST_PAUSE_S if unread else POLL_S)
-                item = self._queue.popleft() if self._queue else None
-                self._adds -= isinstance(item, _Add)
-                self._betweens -= isinstance(item, _AddBetween)
-            if isinstance(item, (_Add, _AddBetween)):
-                started_s = time.monotonic()
-                self._write(item)
-                self.writing_took.add(time.monotonic() - started_s)
-            elif isinstance(item, SliceClosed):
-                self._end(item.window_id, item.carried_over)
-            elif isinstance(item, CalibrationConfig):
-                self._configuration = item
-            elif thread.stopping:
-                break
-            else:
-                unread = (self._snippets is not None and self._snippets.write()) or self._read()
+    def close(self) -> None:
+        """Finishes or abandons the open window."""
         self._digests.close()
         if self._open is not None:
             self._end(self._open.window_id, None)
@@ -357,7 +421,7 @@ class Recorder:
         self._latest = windows[-1] if windows else None
         unsolved: list[Path] = []
         for path in reversed(windows):
-            self.thread.beat()
+            self._thread.beat()
             if len(unsolved) == UNSOLVED_RESUMED:
                 break
             with contextlib.suppress(CoecError, OSError):
@@ -367,11 +431,11 @@ class Recorder:
         for path in unsolved:
             self._hand_over(path.stem, path, live=False)
         if self._snippets is not None:
-            self._snippets.resume(self.thread.beat)
+            self._snippets.resume(self._thread.beat)
 
     def _salvage(self, part: Path) -> None:
         try:
-            window = salvage(part, self.thread.beat)
+            window = salvage(part, self._thread.beat)
             if window is not None and window.pairs < self._plan.min_pairs:
                 storage.remove(window.path)
                 window = None
@@ -386,10 +450,7 @@ class Recorder:
 
     def _hand_over(self, window_id: str, path: Path, *, live: bool) -> None:
         self._store.hold(window_id)
-        try:
-            self._on_recorded(window_id, path, live)
-        finally:
-            self._store.release(window_id)
+        self._post(self._plan.rig.pair, WindowRecorded(window_id, path, live))
 
     def _write(self, item: _Add | _AddBetween) -> None:
         if item.window_id == self._lost:
@@ -413,7 +474,7 @@ class Recorder:
 
     def _start(self, item: _Add) -> _OpenWindow:
         plan = self._plan  # `follow` may replace it meanwhile
-        self._store.make_room(self.thread.beat)
+        self._store.make_room(self._thread.beat)
         writer = WindowWriter(
             self._store.path(item.window_id),
             plan.rig,
@@ -427,7 +488,7 @@ class Recorder:
 
     def _end(self, window_id: str, carried_over: CarriedOverPairs | None) -> None:
         if self._open is None or self._open.window_id != window_id:
-            self._on_lost(window_id)
+            self._post(self._plan.rig.pair, WindowLost(window_id))
             return
         opened = self._open
         try:
@@ -435,12 +496,12 @@ class Recorder:
                 self._add_carried_over(carried_over, opened)
             if opened.pairs < opened.min_pairs:
                 self._close_stray()
-                self._on_lost(window_id)
+                self._post(self._plan.rig.pair, WindowLost(window_id))
                 return
             recorded = opened.writer.finish()
         except (RecordingError, OSError) as error:
             self._lose(window_id, error)
-            self._on_lost(window_id)
+            self._post(self._plan.rig.pair, WindowLost(window_id))
             return
         self._open = None
         self._finished(recorded)
@@ -452,7 +513,7 @@ class Recorder:
         try:
             into.writer.note_carried_over(carried_over.window_id, carried_over.since_ns)
             for pair in pairs_since(self._store.path(carried_over.window_id), carried_over.since_ns):
-                self.thread.beat()
+                self._thread.beat()
                 into.writer.add(pair)
                 into.pairs += 1
         except WindowError as error:

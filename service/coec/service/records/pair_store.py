@@ -7,7 +7,6 @@ immutable.
 """
 
 import logging
-import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ import numpy as np
 from coec.calibration.frames.window import CarriedOverPairs
 from coec.calibration.state import PairState, Provenance, aged, carried_over_pairs, initial_state, overdue, restored
 from coec.calibration.state_machine import HealthState
-from coec.calibration.types import Reason, Rig
+from coec.calibration.types import Matrix4, Reason, Rig
 from coec.config import StateConfig
 from coec.errors import NotFoundError, StateError
 from coec.io.disk_writer import DiskWriter
@@ -33,12 +32,11 @@ from coec.schemas.replies import (
     MetricsPoint,
     RetentionReason,
 )
-from coec.service.engine.frame_selector import ServedExtrinsic
 from coec.service.recording.window_store import WindowStore, WindowVersion
 from coec.service.records.history import GENESIS, CheckLog, HistoryRecord, PairHistory
 from coec.service.records.incidents import Incidents, Side
 from coec.service.records.state_store import Clocks, LostPart, StateStore
-from coec.service.timing import NS_PER_S
+from coec.service.timing import NS_PER_S, Clock
 
 _log = logging.getLogger(__name__)
 
@@ -52,6 +50,14 @@ DEFAULT_TEXTS = {
     HealthState.UNKNOWN: "What is served has not been looked at.",
 }
 """Text for a state of health that comes without reasons."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ServedExtrinsic:
+    """An extrinsic (4, 4) that is or was served; `epoch` counts the extrinsics that were served."""
+
+    epoch: int
+    T_camera_lidar: Matrix4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,8 +101,10 @@ class PairStore:
         disk_writer: DiskWriter,
         folder: WindowStore,
         losses: LossCounter,
+        clock: Clock,
     ) -> None:
         self._rig = rig
+        self._clock = clock
         self._disk_writer = disk_writer
         self._vehicle = vehicle
         self._store = store
@@ -104,7 +112,7 @@ class PairStore:
         self._losses = losses
         self._completed_s: float | None = None
         self._completed_stamp_ns: int | None = None
-        self._since_ns = time.time_ns()
+        self._since_ns = self._clock.wall_ns()
         self.damage: Reason | None = None
         self.transitions: Counter[str] = Counter()
         self._epoch = 0
@@ -116,18 +124,18 @@ class PairStore:
         self._checks = CheckLog(config.directory / f"checks-{rig.pair}.jsonl", config.checks)
         self.protect()
         disk_writer.register(self.history, self.incidents, self._checks, store)
-        disk_writer.on_replaced(lambda text: self.history.append(_entry("chain", "rewritten", text)))
+        disk_writer.on_replaced(self._note_replaced)
         if self.damage is not None:
-            self.history.append(_entry("chain", self.damage.code, self.damage.text))
+            self.history.append(self._entry("chain", self.damage.code, self.damage.text))
         if self.history.damage is not None:
             losses.add("storage", "history_damaged", detail=self.history.damage)
             text = f"The chain of the history is broken: {self.history.damage}. It is kept aside."
             self.damage = self.damage or Reason("history_damaged", text)
-            self.history.append(_entry("chain", "broken", text))
+            self.history.append(self._entry("chain", "broken", text))
         if self.damage is not None:
             self.save()
         if self._state.health is not remembered.health:
-            self._since_ns = time.time_ns()
+            self._since_ns = self._clock.wall_ns()
             self._note_health(remembered, self._state, None)
 
     @property
@@ -163,7 +171,7 @@ class PairStore:
     @property
     def age_s(self) -> float | None:
         """Time since a check was last completed or a window accepted, s; None if unknown."""
-        return None if self._completed_s is None else time.monotonic() - self._completed_s
+        return None if self._completed_s is None else self._clock.monotonic_s() - self._completed_s
 
     def update(
         self,
@@ -190,7 +198,7 @@ class PairStore:
         replaced = not np.array_equal(before.T_camera_lidar, after.T_camera_lidar)
         after = self._state = replace(after, record=record.entered(after.health, replaced=replaced))
         if completed:
-            self._completed_s, self._completed_stamp_ns = time.monotonic(), stamp_ns
+            self._completed_s, self._completed_stamp_ns = self._clock.monotonic_s(), stamp_ns
             self.damage = None if self.history.damage is None else self.damage
         self._note(before, after, stamp_ns, replaced=replaced)
         self.save()
@@ -200,7 +208,7 @@ class PairStore:
         """A window was solved."""
         reasons = "; ".join(reason.text for reason in result.verdict.reasons)
         text = reasons or f"A window of {result.pairs} pairs was accepted."
-        entry = _entry("estimate", result.verdict.decision, text, result.data_stamp_ns)
+        entry = self._entry("estimate", result.verdict.decision, text, result.data_stamp_ns)
         self.history.append(entry.model_copy(update={"window_id": result.window_id}), result)
 
     def note_check(self, check: CheckReply) -> None:
@@ -228,11 +236,13 @@ class PairStore:
             entry = last.entry
             if (entry.kind, entry.code, entry.text) == ("command", code, entry_text):
                 return
-        self.history.append(_entry("command", code, entry_text).model_copy(update={"sender": sender, "reason": reason}))
+        self.history.append(
+            self._entry("command", code, entry_text).model_copy(update={"sender": sender, "reason": reason})
+        )
 
     def note_commissioned(self, text: str, window_ids: tuple[str, ...]) -> None:
         """The rig has a baseline, learned from these windows."""
-        self.history.append(_entry("commissioned", "commissioned", text))
+        self.history.append(self._entry("commissioned", "commissioned", text))
         self._commissioned_from = window_ids
         self.protect()
 
@@ -277,9 +287,9 @@ class PairStore:
     def save(self) -> None:
         """Has all books put on the disk: those of the history before the state, because the state names their ends."""
         age_s = self.age_s
-        completed_ns = None if age_s is None else time.time_ns() - round(age_s * NS_PER_S)
+        completed_ns = None if age_s is None else self._clock.wall_ns() - round(age_s * NS_PER_S)
         clocks = Clocks(completed_ns, self._completed_stamp_ns, self._since_ns)
-        heads, windows = (lambda: self.history.durable_heads), self._commissioned_from
+        heads, windows = self._durable_heads, self._commissioned_from
         self._store.update(self._rig, self._state, clocks, heads, windows)
         self._disk_writer.write(self.history, self.incidents, self._store)
 
@@ -288,8 +298,8 @@ class PairStore:
         return self._disk_writer.has_written()
 
     def may_be_published(self) -> bool:
-        """Whether the state is on the disk, or `health` says why not."""
-        return self._disk_writer.has_written() or self._disk_writer.problem is not None
+        """Whether the state is on the disk, or `health` says why not. Does not wait."""
+        return self._disk_writer.has_written(0.0) or self._disk_writer.problem is not None
 
     def age(self, why_overdue: Reason | None, silent_s: float, stale_after_s: float) -> None:
         """Time has passed: ages the state. `why_overdue` says why no check was completed in time (None: one was);
@@ -303,6 +313,24 @@ class PairStore:
             self.update(passed, None, completed=False)
 
     # --- inside -----------------------------------------------------------------------------------------------------
+
+    def _note_replaced(self, text: str) -> None:
+        self.history.append(self._entry("chain", "rewritten", text))
+
+    def _durable_heads(self) -> Mapping[str, str]:
+        return self.history.durable_heads
+
+    def _entry(self, kind: EntryKind, code: str, text: str, stamp_ns: int | None = None) -> HistoryEntry:
+        """An entry dated now; its place in the chain is filled in when it is appended."""
+        return HistoryEntry(
+            sequence=0,
+            previous_sha256=GENESIS,
+            kind=kind,
+            code=code,
+            text=text,
+            wall_ns=self._clock.wall_ns(),
+            stamp_ns=stamp_ns,
+        )
 
     def _restore(self) -> tuple[PairState, Mapping[str, str]]:
         damage = self._store.damage
@@ -325,12 +353,12 @@ class PairStore:
             return initial_state(self._rig), {}
         self._commissioned_from = remembered.commissioned_from
         clocks = remembered.clocks
-        now_ns = time.time_ns()
+        now_ns = self._clock.wall_ns()
         if clocks.since_wall_ns is not None and clocks.since_wall_ns <= now_ns:
             self._since_ns = clocks.since_wall_ns
         # A clock that was set back since, or has not been set yet, cannot say how old the check is.
         if clocks.completed_wall_ns is not None and clocks.completed_wall_ns <= now_ns:
-            self._completed_s = time.monotonic() - (now_ns - clocks.completed_wall_ns) / NS_PER_S
+            self._completed_s = self._clock.monotonic_s() - (now_ns - clocks.completed_wall_ns) / NS_PER_S
             self._completed_stamp_ns = clocks.completed_stamp_ns
         return remembered.state, remembered.history_heads
 
@@ -338,19 +366,19 @@ class PairStore:
         window_id = after.accepted.window_id if after.accepted else None
         if replaced or before.provenance is not after.provenance:
             self._epoch += replaced
-            entry = _entry("extrinsic", after.provenance.value, _ORIGIN[after.provenance], stamp_ns)
+            entry = self._entry("extrinsic", after.provenance.value, _ORIGIN[after.provenance], stamp_ns)
             served = {"camera_from_lidar": transform_of(after.T_camera_lidar), "window_id": window_id}
             self.history.append(entry.model_copy(update=served))
             fields = {"pair": self._rig.pair, "provenance": after.provenance.value, "window": window_id}
             _log.info(_ORIGIN[after.provenance], extra={"fields": fields})
         if before.health is not after.health:
-            self._since_ns = time.time_ns()
+            self._since_ns = self._clock.wall_ns()
             self._note_health(before, after, stamp_ns)
 
     def _note_health(self, before: PairState, after: PairState, stamp_ns: int | None) -> None:
         self.transitions[after.health.value] += 1
         text = "; ".join(reason.text for reason in after.reasons) or DEFAULT_TEXTS.get(after.health, "")
-        self.history.append(_entry("state", after.health.value, text, stamp_ns))
+        self.history.append(self._entry("state", after.health.value, text, stamp_ns))
         fields = {"pair": self._rig.pair, "from": before.health.value, "to": after.health.value, "why": text}
         _log.info(f"health: {after.health.value}, before {before.health.value}", extra={"fields": fields})
         if after.health is HealthState.MISCALIBRATED:
@@ -359,7 +387,7 @@ class PairStore:
             self.incidents.resolve(stamp_ns, f"{after.health.value}: {text}")
 
     def _begin_incident(self, state: PairState, stamp_ns: int | None) -> None:
-        at_ns = stamp_ns if stamp_ns is not None else time.time_ns()
+        at_ns = stamp_ns if stamp_ns is not None else self._clock.wall_ns()
         since_ns = state.flagged_since_ns if state.flagged_since_ns is not None else at_ns
         by_window = state.pending is not None and state.latest is state.pending.estimate
         # The window that contradicts the served extrinsic cannot be the window before the event.
@@ -377,7 +405,7 @@ class PairStore:
                 vehicle=self._vehicle,
                 pair=self._rig.pair,
                 stamp_ns=at_ns,
-                wall_ns=time.time_ns(),
+                wall_ns=self._clock.wall_ns(),
                 reasons=tuple(replies.Reason(code=reason.code, text=reason.text) for reason in state.reasons),
                 camera_from_lidar=transform_of(state.T_camera_lidar),
                 window_before=earlier[-1] if earlier else None,
@@ -430,10 +458,3 @@ _ORIGIN = {
     Provenance.ESTIMATED: "An accepted estimate is served.",
     Provenance.RESTORED: "An earlier calibration is served again.",
 }
-
-
-def _entry(kind: EntryKind, code: str, text: str, stamp_ns: int | None = None) -> HistoryEntry:
-    """An entry dated now; its place in the chain is filled in when it is appended."""
-    return HistoryEntry(
-        sequence=0, previous_sha256=GENESIS, kind=kind, code=code, text=text, wall_ns=time.time_ns(), stamp_ns=stamp_ns
-    )
