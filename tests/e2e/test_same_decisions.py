@@ -3,6 +3,7 @@ the machine does meanwhile."""
 
 from __future__ import annotations
 
+import json
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,12 @@ from coec.config import (
     ObjectiveConfig,
     SearchConfig,
     WindowConfig,
+    load_config,
 )
 from coec.io.mcap.bag_writer import write_bag
 from coec.io.zenoh.player import Frame
+from coec.service.decision_log import differences, read_log
+from coec.service.drive_replay import DriveReplay
 from e2e.drives import (
     NS_PER_S,
     SECONDS,
@@ -127,6 +131,14 @@ def test_killed_in_a_solve_and_replayed_the_decisions_are_the_same(tmp_path: Pat
     assert [done.returncode for done in replayed] == [0] * SLICES, [done.stdout + done.stderr for done in replayed]
     assert all("identical" in done.stdout for done in replayed)
 
+    pair = load_config(config).pairs[0].name
+    vehicle = read_log(tmp_path / "live" / "state", pair)
+    frames = between(small, 0, finished_s + OVER_S)
+    drive = DriveReplay(load_config(config), tmp_path / "replayed", frames[0].stamp_ns, 1)
+    whole = drive.run(iter(frames), lambda _: None)
+    assert {one.kind for one in vehicle} >= {"estimate", "extrinsic", "state"}
+    assert differences(vehicle, whole.decisions) == ()
+
 
 def decisions(running: Service) -> dict[str, Any]:
     """All of it, of a run that was not interrupted."""
@@ -171,6 +183,13 @@ def test_live_restarted_and_replayed_the_decisions_are_the_same(
         replayed = decisions(running)
         assert running.terminate() == 0
     assert replayed == live
+
+    log = tmp_path / "decisions.jsonl"
+    compared = coec("replay", bag, "--config", config, "--against", tmp_path / "live" / "state", "--log", log, "--json")
+    assert compared.returncode == 0, (compared.stdout, compared.stderr)
+    document = json.loads(compared.stdout)
+    assert document["differences"] == []
+    assert document["elapsed_s"] < document["driven_s"]
 
     config = stepped_configuration(tmp_path / "restarted", router, network)
     with service(config, router) as running:

@@ -1,22 +1,101 @@
-"""`coec replay`: computes the recorded decision again, from the file alone."""
+"""`coec replay`: a recorded decision again, from the file of its window alone; or a whole drive through the engine."""
 
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from itertools import takewhile
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from coec.cli.options import Json
-from coec.errors import WindowError
+from coec.cli.options import Json, Source
+from coec.errors import SourceError, UsageError, WindowError
+
+if TYPE_CHECKING:
+    from coec.config import Config
+    from coec.io.recordings.recording_source import RecordingSource, SensorMessage
+    from coec.service.decision_log import Difference
+    from coec.service.drive_replay import ReplayedDrive
+
+NS_PER_S = 1_000_000_000
+
+AROUND_S = 1.0
+"""Sensor time before and after the moment that is explained."""
 
 
 def replay(
-    window: Annotated[Path, typer.Argument(help="A recorded window with its result (.mcap).", show_default=False)],
+    source: Source,
     depth: Annotated[
-        str | None, typer.Option(help="Depth network, if it has moved since the window was recorded.", metavar="MODEL")
+        str | None,
+        typer.Option(
+            help="Depth network: of a window, if it has moved since; of a drive, in place of the configured one.",
+            metavar="MODEL",
+        ),
     ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(help="Configuration of the service whose drive it is; else defaults.", metavar="FILE"),
+    ] = None,
+    pair: Annotated[str | None, typer.Option(help="Pair of the configuration.")] = None,
+    log: Annotated[Path | None, typer.Option(help="Write the decisions of the drive here (JSON lines).")] = None,
+    against: Annotated[
+        Path | None,
+        typer.Option(
+            help="Compare the decisions with this log, or the state directory of a service; exit 1 if they differ.",
+            metavar="LOG|DIR",
+        ),
+    ] = None,
+    begin_s: Annotated[float, typer.Option("--from", help="Begin so many seconds into the drive.", min=0.0)] = 0.0,
+    until_s: Annotated[
+        float | None, typer.Option("--until", help="End so many seconds into the drive.", min=0.0)
+    ] = None,
+    explain_s: Annotated[
+        float | None,
+        typer.Option(
+            "--explain", help="Show which events led to which actions so many seconds into the drive.", min=0.0
+        ),
+    ] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a page with the decisions and differences here.")] = None,
     as_json: Json = False,
 ) -> int:
-    """Reproduce the recorded decision from the file alone: exit 1 if a byte of it differs."""
+    """Reproduce the recorded decision of a window, or replay a whole drive through the engine of the service.
+
+    A window with its result (.mcap) is solved again from the file alone: exit 1 if a byte of the result differs. Any
+    other recording goes through the engine of the service, faster than real time and without losing a frame; its
+    decisions are listed, and compared with those of another version or of a vehicle.
+    """
+    window = Path(source)
+    of_drive = {"--config": config, "--pair": pair, "--log": log, "--against": against, "--report": report}
+    if _is_window(window):
+        given = [name for name, value in of_drive.items() if value is not None]
+        if given or begin_s or until_s is not None or explain_s is not None:
+            raise UsageError(f"{window} is a window: {', '.join(given) or 'a part'} applies to the replay of a drive")
+        return _replay_window(window, depth, as_json=as_json)
+    recording, configuration = _opened(source, config, pair, depth)
+    replayed = _replay_drive(recording, configuration, begin_s, until_s)
+    return _show_drive(replayed, recording, configuration.pairs[0].name, (log, against, report), explain_s, as_json)
+
+
+# --- a window -------------------------------------------------------------------------------------------------------
+
+
+def _is_window(path: Path) -> bool:
+    """Whether this is the file of a window, with or without a result."""
+    from coec.io.mcap.window_reader import read_result, read_window
+
+    if path.suffix != ".mcap" or not path.is_file():
+        return False
+    try:
+        if read_result(path) is None:
+            read_window(path)
+    except WindowError:
+        return False
+    return True
+
+
+def _replay_window(window: Path, depth: str | None, *, as_json: bool) -> int:
     from coec.calibration.pipeline import calibrate
     from coec.config import LimitsConfig
     from coec.io.depth.depth_maps import open_depth
@@ -39,7 +118,7 @@ def replay(
         )
     reached = comparable(result_of(estimate, recorded_window.rig, recorded.vehicle), recorded)
     identical = to_json(reached) == to_json(recorded)
-    differences = _differences(recorded.model_dump(mode="json"), reached.model_dump(mode="json"))
+    differences = _value_differences(recorded.model_dump(mode="json"), reached.model_dump(mode="json"))
     if as_json:
         console.print_json(
             {
@@ -60,19 +139,190 @@ def replay(
     return 0 if identical else 1
 
 
-def _differences(recorded: Any, reached: Any, at: str = "") -> list[tuple[str, Any, Any]]:
+def _value_differences(recorded: Any, reached: Any, at: str = "") -> list[tuple[str, Any, Any]]:
     """(place, recorded, reached) of every value that differs."""
     if isinstance(recorded, dict) and isinstance(reached, dict):
         keys = sorted(recorded.keys() | reached.keys())
         return [
             difference
             for key in keys
-            for difference in _differences(recorded.get(key), reached.get(key), f"{at}.{key}" if at else key)
+            for difference in _value_differences(recorded.get(key), reached.get(key), f"{at}.{key}" if at else key)
         ]
     if isinstance(recorded, list) and isinstance(reached, list) and len(recorded) == len(reached):
         return [
             difference
             for index, (before, after) in enumerate(zip(recorded, reached, strict=True))
-            for difference in _differences(before, after, f"{at}[{index}]")
+            for difference in _value_differences(before, after, f"{at}[{index}]")
         ]
     return [] if recorded == reached else [(at, recorded, reached)]
+
+
+# --- a drive --------------------------------------------------------------------------------------------------------
+
+
+def _opened(source: str, file: Path | None, name: str | None, depth: str | None) -> tuple[RecordingSource, Config]:
+    """The recording, and a configuration with the one pair that takes it."""
+    from coec.cli.convert import configuration_for
+    from coec.config import Config, load_config
+    from coec.io.recordings.layouts import open_source
+
+    recording = open_source(source)
+    if file is None:
+        pair = configuration_for(recording, recording.T_camera_lidar_start, None)
+        config = Config(pairs=(pair,))
+    else:
+        config = load_config(file)
+        pairs = [pair for pair in config.pairs if name in (None, pair.name)]
+        if len(pairs) != 1:
+            known = ", ".join(pair.name for pair in config.pairs)
+            raise UsageError(f"{file} has {'no such pair' if name else 'several pairs'}: --pair is one of {known}")
+        config = config.model_copy(update={"pairs": tuple(pairs)})
+        (pair,) = pairs
+    if depth is not None:
+        network = pair.calibration.depth.model_copy(update={"model": depth})
+        calibration = pair.calibration.model_copy(update={"depth": network})
+        config = config.model_copy(update={"pairs": (pair.model_copy(update={"calibration": calibration}),)})
+    return recording, config
+
+
+def _replay_drive(recording: RecordingSource, config: Config, begin_s: float, until_s: float | None) -> ReplayedDrive:
+    from tempfile import TemporaryDirectory
+
+    from coec.reports import console
+    from coec.service.drive_replay import DriveReplay
+
+    if not recording.camera_stamps_ns:
+        raise SourceError(f"{recording.name} holds no camera frame")
+    first_ns = recording.camera_stamps_ns[0]
+    begin_ns = first_ns + round(begin_s * NS_PER_S)
+    end_ns = recording.camera_stamps_ns[-1] if until_s is None else first_ns + round(until_s * NS_PER_S)
+    if begin_ns > min(end_ns, recording.camera_stamps_ns[-1]):
+        raise UsageError(f"no camera frame lies between --from and --until: {recording.name} is shorter")
+
+    def frames() -> Iterator[SensorMessage]:
+        for frame in takewhile(lambda frame: frame.stamp_ns <= end_ns, recording.messages()):
+            if frame.stamp_ns >= begin_ns:
+                yield frame
+
+    with TemporaryDirectory() as folder, console.progress() as bars:
+        task = bars.add_task(recording.name, total=max((end_ns - begin_ns) / NS_PER_S, 1e-3))
+        drive = DriveReplay(config, Path(folder), begin_ns, min(len(os.sched_getaffinity(0)), 2))
+        return drive.run(frames(), lambda stamp_ns: bars.update(task, completed=(stamp_ns - begin_ns) / NS_PER_S))
+
+
+def _show_drive(
+    replayed: ReplayedDrive,
+    recording: RecordingSource,
+    pair: str,
+    files: tuple[Path | None, Path | None, Path | None],
+    explain_s: float | None,
+    as_json: bool,
+) -> int:
+    from coec.reports import console
+    from coec.service.decision_log import differences, read_log, write_log
+
+    log, against, report = files
+    first_ns = recording.camera_stamps_ns[0]
+    found = () if against is None else differences(read_log(against, pair), replayed.decisions)
+    if log is not None:
+        write_log(log, replayed.decisions)
+    if report is not None:
+        from coec.service.replay_page import write_replay_page
+
+        write_replay_page(report, recording.name, replayed, first_ns, None if against is None else found)
+    if as_json:
+        console.print_json(_document(replayed, None if against is None else found))
+        return 1 if found else 0
+    if explain_s is not None:
+        _explain(replayed, first_ns, explain_s)
+        return 1 if found else 0
+    _table(replayed, first_ns)
+    if against is not None:
+        _show_differences(found, against, first_ns)
+    return 1 if found else 0
+
+
+def _document(replayed: ReplayedDrive, found: tuple[Difference, ...] | None) -> dict[str, Any]:
+    return {
+        "driven_s": replayed.driven_s,
+        "elapsed_s": replayed.elapsed_s,
+        "health": replayed.health,
+        "decisions": [
+            {"kind": one.kind, "stamp_ns": one.stamp_ns, "name": one.name, "values": one.values}
+            for one in replayed.decisions
+        ],
+        "losses": [
+            {"place": place, "cause": cause, "count": number}
+            for (place, cause), number in sorted(replayed.losses.items())
+        ],
+        "differences": None
+        if found is None
+        else [
+            {
+                "kind": one.either.kind,
+                "stamp_ns": one.either.stamp_ns,
+                "before": None if one.before is None else one.before.name,
+                "after": None if one.after is None else one.after.name,
+                "fields": one.fields,
+            }
+            for one in found
+        ],
+    }
+
+
+def _table(replayed: ReplayedDrive, first_ns: int) -> None:
+    """Prints what was decided, without the checks that changed nothing."""
+    from coec.reports import console
+    from coec.reports.formatting import count
+    from coec.service.replay_page import outline
+
+    checks = [one for one in replayed.decisions if one.kind == "check"]
+    windows = [one for one in replayed.decisions if one.kind == "estimate"]
+    table = console.table("s", "decision", "", "")
+    for line in outline(replayed.decisions, first_ns):
+        table.add_row(line.time, line.kind, line.name, line.text)
+    console.out.print(table)
+    lost = sum(replayed.losses.values())
+    pace = replayed.driven_s / max(replayed.elapsed_s, 1e-9)
+    console.show(
+        f"{count(len(checks), 'check')}, {count(len(windows), 'window')}, {count(lost, 'loss', 'losses')}, "
+        f"{replayed.health} at the end; {replayed.driven_s:.0f} s of driving in {replayed.elapsed_s:.0f} s ({pace:.1f} times as fast)"
+    )
+
+
+def _show_differences(found: tuple[Difference, ...], against: Path, first_ns: int) -> None:
+    from coec.reports import console
+    from coec.reports.formatting import count
+
+    if not found:
+        console.show(f"equal to {against}", "bold green")
+        return
+    console.show(f"{count(len(found), 'difference')} from {against}", "bold red")
+    table = console.table("s", "decision", "there", "here", "fields")
+    for one in found:
+        before, after = one.before, one.after
+        table.add_row(
+            f"{(one.either.stamp_ns - first_ns) / NS_PER_S:.1f}",
+            one.either.kind,
+            "none" if before is None else before.name,
+            "none" if after is None else after.name,
+            ", ".join(one.fields[:4]) + (" ..." if len(one.fields) > 4 else ""),
+        )
+    console.out.print(table)
+
+
+def _explain(replayed: ReplayedDrive, first_ns: int, moment_s: float) -> None:
+    """Prints the steps of the engine around a moment of the drive."""
+    from coec.reports import console
+    from coec.service.replay_page import transition_text
+
+    table = console.table("s", "event", "actions", "health")
+    for one in replayed.transitions:
+        at_s = (one.stamp_ns - first_ns) / NS_PER_S
+        if abs(at_s - moment_s) <= AROUND_S:
+            event, actions = transition_text(one)
+            before, after = one.health
+            table.add_row(f"{at_s:.1f}", event, actions, after if before == after else f"{before} to {after}")
+    if not table.row_count:
+        raise UsageError(f"the engine did nothing within {AROUND_S:g} s of {moment_s:g} s")
+    console.out.print(table)

@@ -145,7 +145,7 @@ class CameraLidarPair:
         elif isinstance(event, Reconfigured):
             self._pair = event.pair
             self._executor.reconfigure(event.pair)
-        self._do(self.engine.step(event))
+        self._step(event)
         if isinstance(event, WindowRecorded):
             self._context.folder.release(event.window_id)  # which its job holds by now
         return None
@@ -161,14 +161,14 @@ class CameraLidarPair:
         self.engine.warms_up = self._context.worker.warms_up
         stamp_ns = self.stream.held.next_ns
         if self.recorder.has_room:
-            self._do(self.engine.step(SensorTime(stamp_ns)))
+            self._step(SensorTime(stamp_ns))
             if not self.engine.waits(stamp_ns):
                 self.stream.held.stop_waiting()
-                self._do(self.engine.step(self.stream.take()))
+                self._step(self.stream.take())
                 return True
         if not self.stream.held.has_waited(now_s):
             return False
-        self._do(self.engine.step(self.stream.take()))
+        self._step(self.stream.take())
         return True
 
     def tick(self, *, waiting: bool) -> None:
@@ -178,16 +178,16 @@ class CameraLidarPair:
         if end_ns is not None and self.stream.silence_ends(end_ns):
             self.stream.end_in_silence(end_ns, self.engine.selector.statistics.last_ns)
             if not self.stream.held:
-                self._do(self.engine.step(SensorTime(end_ns)))
+                self._step(SensorTime(end_ns))
 
     def _tick(self) -> None:
-        self._do(self.engine.step(Tick(self._context.worker.compiled_s, self.stream.report)))
+        self._step(Tick(self._context.worker.compiled_s, self.stream.report))
 
     def finish_pairs(self) -> None:
         """Evaluates every frame pair that has come, even if it should wait for a result."""
         self.stream.flush()
         while self.stream.held:
-            self._do(self.engine.step(self.stream.take()))
+            self._step(self.stream.take())
 
     def finish_window(self) -> None:
         """Ends the open window when the service ends; called after the thread of the engine has ended."""
@@ -195,6 +195,9 @@ class CameraLidarPair:
         self.finish_pairs()
         closed = self.engine.selector.finish()
         self._do([] if closed is None else [closed])
+
+    def _step(self, event: Event) -> None:
+        self._do(self.engine.step(event))
 
     # --- actions ----------------------------------------------------------------------------------------------------
 

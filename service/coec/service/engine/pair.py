@@ -151,6 +151,11 @@ class Pair:
         """Number of requests without a result."""
         return self._schedule.unanswered
 
+    @property
+    def oldest_request(self) -> PairRequest | None:
+        """The request whose result is to be concluded next; None if there is none."""
+        return self._schedule.oldest
+
     def needs_tick(self, monotonic_s: float) -> bool:
         """Whether the step `Tick` is due: something has changed or is unpublished, or time has passed."""
         return self._has_changed or self.is_unpublished or monotonic_s - self._clocks_checked_s >= TICK_S

@@ -90,6 +90,11 @@ class Schedule(Generic[Subject, Result, Change]):
         return [one for one in self._open if one.result is None and one.expires_s <= now_s]
 
     @property
+    def oldest(self) -> Request[Subject, Result, Change] | None:
+        """The oldest request that is not concluded; None if there is none."""
+        return self._open[0] if self._open else None
+
+    @property
     def unanswered(self) -> int:
         """Number of requests that are not concluded."""
         return len(self._open)

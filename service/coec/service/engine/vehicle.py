@@ -125,7 +125,7 @@ class Vehicle:
         """A stream of this kind: an existing one that reads the same, else a new one."""
         alike = read_alike(kind, stream)
         if alike not in self._sensors:
-            sensor = SensorStream(kind, f"{kind}-{len(self._sensors)}", stream, self._limits)
+            sensor = SensorStream(kind, f"{kind}-{len(self._sensors)}", stream, self._limits, self.clock.monotonic_s)
             self._by_number[sensor.number] = sensor
             self.inbox.open(sensor.number, sensor.depth)
             self._unsubscribed.append(sensor)

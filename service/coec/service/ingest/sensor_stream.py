@@ -102,13 +102,20 @@ class SensorStream:
         takers: functions that get each frame, in the order in which the frames came.
     """
 
-    def __init__(self, kind: str, number: str, config: KnownStreamConfig, limits: LimitsConfig) -> None:
+    def __init__(
+        self,
+        kind: str,
+        number: str,
+        config: KnownStreamConfig,
+        limits: LimitsConfig,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self.kind = kind
         self.number = number
         self.config = config
         self.losses = LossCounter(_log, config.sensor, "sensor")
         self.decoder = Decoder(kind, config, limits, self.losses)
-        self.log = StreamLog(kind, config.sensor)
+        self.log = StreamLog(kind, config.sensor, clock)
         self.took = Histogram(QUICK_S)
         self.takers: tuple[Callable[[Frame], None], ...] = ()
         self._on_trial: list[Frame] = []

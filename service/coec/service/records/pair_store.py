@@ -218,6 +218,10 @@ class PairStore:
         self._checks.append(check)
         self._disk_writer.write(self._checks, self.incidents)
 
+    def checks(self) -> tuple[CheckReply, ...]:
+        """All checks that are kept, oldest first."""
+        return self._checks.checks()
+
     def publishable_records(self) -> PairRecords:
         """The books that may be reported: only what is on the disk, so that a restart would know it, too. If the disk
         has refused for so long that `health` reports it, everything."""

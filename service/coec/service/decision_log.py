@@ -1,0 +1,173 @@
+"""What a pair decided on a drive, in the order of sensor time, and how two such logs differ.
+
+A log is made of the records of a pair: every check, every window's estimate, every extrinsic that was served, every
+state of health. It has one JSON object a line. States that the steady clock alone brings about, such as a check that is
+overdue, have no sensor time and depend on the machine; a log leaves them out, and the return from them.
+"""
+
+import json
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from coec.errors import SourceError, UsageError
+from coec.service.records.history import CheckLog, PairHistory
+from coec.service.records.pair_store import PairRecords
+
+KINDS = ("check", "estimate", "extrinsic", "state")
+"""Of decisions, in the order in which those of one stamp are listed."""
+
+MOST_ENTRIES, MOST_CHECKS = 10_000, 100_000
+"""Entries of the history, and checks, of a log: as many as a service can keep."""
+
+MOST_BYTES = 2**28
+"""Largest log that is read."""
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """One decision.
+
+    Attributes:
+        kind: one of `KINDS`.
+        stamp_ns: sensor time of the data behind it.
+        name: what it is about: id of the window, outcome of the checks, provenance of the extrinsic, state.
+        values: everything that is compared.
+    """
+
+    kind: str
+    stamp_ns: int
+    name: str
+    values: dict[str, Any]
+
+    def line(self) -> str:
+        """As a line of a log."""
+        document = {"kind": self.kind, "stamp_ns": self.stamp_ns, "name": self.name, "values": self.values}
+        return json.dumps(document, sort_keys=True, separators=(",", ":"))
+
+
+def decisions_of(records: PairRecords) -> tuple[Decision, ...]:
+    """The decisions in the records of a pair."""
+    return tuple(sorted(_decisions(records), key=lambda one: (one.stamp_ns, KINDS.index(one.kind))))
+
+
+def _decisions(records: PairRecords) -> Iterator[Decision]:
+    for check in records.checks:
+        values = check.model_dump(mode="json", exclude={"state"})
+        yield Decision("check", check.stamp_ns, check.outcome, values)
+    state = ""
+    for record in records.entries:
+        entry = record.entry
+        if entry.stamp_ns is None or (entry.kind == "state" and entry.code == state):
+            continue
+        state = entry.code if entry.kind == "state" else state
+        if record.result is not None:
+            yield Decision("estimate", entry.stamp_ns, entry.code, record.result.model_dump(mode="json"))
+        elif entry.kind in ("extrinsic", "state"):
+            pose = None if entry.camera_from_lidar is None else entry.camera_from_lidar.matrix
+            values = {"code": entry.code, "window_id": entry.window_id, "camera_from_lidar": pose}
+            yield Decision(entry.kind, entry.stamp_ns, entry.code, values)
+
+
+def read_log(path: Path, pair: str) -> tuple[Decision, ...]:
+    """The decisions in a log, or in the state directory of a service.
+
+    Raises:
+        SourceError: there is no such file, or it is neither.
+    """
+    if path.is_dir():
+        return _of_state_directory(path, pair)
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise SourceError(f"{path} is larger than {MOST_BYTES / 1e6:.0f} MB: it is no log of decisions")
+        documents = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        return tuple(
+            Decision(str(one["kind"]), int(one["stamp_ns"]), str(one["name"]), dict(one["values"])) for one in documents
+        )
+    except OSError as error:
+        raise SourceError(f"{path} cannot be read: {error.strerror}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise SourceError(f"{path} is no log of decisions: write one with `coec replay DRIVE --log FILE`") from error
+
+
+def _of_state_directory(folder: Path, pair: str) -> tuple[Decision, ...]:
+    """Reads copies of the files, because damaged ones are set aside when they are opened."""
+    with TemporaryDirectory() as copies:
+        try:
+            for file in folder.glob(f"*-{pair}.jsonl"):
+                if file.stat().st_size > MOST_BYTES:
+                    raise SourceError(f"{file} is larger than {MOST_BYTES / 1e6:.0f} MB")
+                shutil.copyfile(file, Path(copies) / file.name)
+        except OSError as error:
+            raise SourceError(f"{folder} cannot be read: {error.strerror}") from error
+        history = PairHistory(Path(copies), pair, MOST_ENTRIES, {})
+        checks = CheckLog(Path(copies) / f"checks-{pair}.jsonl", MOST_CHECKS)
+        decisions = decisions_of(PairRecords(history.entries(), checks.checks(), ()))
+    if not decisions:
+        raise SourceError(f"{folder} holds no records of a pair {pair}")
+    return decisions
+
+
+def write_log(path: Path, decisions: Iterable[Decision]) -> None:
+    """Writes a log.
+
+    Raises:
+        UsageError: the file cannot be written.
+    """
+    try:
+        path.write_text("".join(f"{one.line()}\n" for one in decisions), encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{path} cannot be written: {error.strerror}") from error
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """A decision that differs. `before`, `after`: None if there is none of this kind at this sensor time. `fields`:
+    places of the values that differ."""
+
+    before: Decision | None
+    after: Decision | None
+    fields: tuple[str, ...] = ()
+
+    @property
+    def either(self) -> Decision:
+        """The decision, of whichever log has it."""
+        decision = self.after or self.before
+        assert decision is not None
+        return decision
+
+
+def differences(before: Sequence[Decision], after: Sequence[Decision]) -> tuple[Difference, ...]:
+    """What differs between two logs, in the order of sensor time. Decisions of one kind and stamp belong together."""
+    keyed_before, keyed_after = _keyed(before), _keyed(after)
+    found = []
+    for key in sorted(keyed_before.keys() | keyed_after.keys()):
+        one, other = keyed_before.get(key), keyed_after.get(key)
+        if one is None or other is None:
+            found.append(Difference(one, other))
+        elif one.values != other.values:
+            found.append(Difference(one, other, tuple(_places(one.values, other.values))))
+    return tuple(found)
+
+
+def _keyed(decisions: Sequence[Decision]) -> dict[tuple[int, int, int], Decision]:
+    """By stamp, kind, and number among those of one stamp and kind."""
+    keyed: dict[tuple[int, int, int], Decision] = {}
+    for decision in decisions:
+        kind = KINDS.index(decision.kind) if decision.kind in KINDS else len(KINDS)
+        number = 0
+        while (decision.stamp_ns, kind, number) in keyed:
+            number += 1
+        keyed[decision.stamp_ns, kind, number] = decision
+    return keyed
+
+
+def _places(before: Any, after: Any, at: str = "") -> Iterator[str]:
+    if isinstance(before, dict) and isinstance(after, dict):
+        for key in sorted(before.keys() | after.keys()):
+            yield from _places(before.get(key), after.get(key), f"{at}.{key}" if at else str(key))
+    elif before != after:
+        yield at

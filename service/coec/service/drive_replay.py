@@ -1,0 +1,313 @@
+"""Replays a recorded drive through the engine of the service: which checks and windows it makes of it, what it serves,
+and when.
+
+The engine is that of the service; no thread runs it. The sensor time of the frames is the clock, so no frame is dropped
+and no time passes while a job runs. A result is handed to the engine when the drive has come to the sensor time from
+which it counts, so two replays are equal to the byte whatever the machine does. Jobs run on worker processes meanwhile.
+"""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame
+from coec.config import BudgetConfig, Config
+from coec.errors import SourceError
+from coec.io.disk_writer import DiskWriter
+from coec.io.msgpack_frames import encode_camera, encode_ego, encode_lidar
+from coec.io.zenoh.bus import MSGPACK, InputSample
+from coec.io.zenoh.ros_node import RosTopicList
+from coec.schemas.keys import Keys
+from coec.service.camera_lidar_pair import CameraLidarPair
+from coec.service.cpu_budget import Budget
+from coec.service.decision_log import MOST_CHECKS, MOST_ENTRIES, Decision, decisions_of
+from coec.service.engine.messages import Action, Event, JobSubject, PairRequest, SensorTime, Tick, WindowSubject
+from coec.service.engine.rig import RigEstimator
+from coec.service.engine.vehicle import Vehicle
+from coec.service.ingest.decoder import CAMERA, EGO, LIDAR
+from coec.service.process_lifetime import joined
+from coec.service.recording.recorder import RecordingThread
+from coec.service.recording.window_store import WindowStore
+from coec.service.records.pair_store import PairRecords
+from coec.service.records.state_store import StateStore
+from coec.service.timing import NS_PER_S, Clock
+from coec.service.vehicle_context import VehicleContext
+from coec.service.worker.supervisor import Worker, WorkerState
+from coec.service.worker.worker_jobs import JobOutcome, Kind, WorkerJob
+
+POLL_S = 0.02
+"""Longest wait for a worker or the disk before events are looked for again, s."""
+
+START_S = 600.0
+"""Longest start of a worker: the first on a machine compiles kernels."""
+
+ATTEMPTS = 3
+"""How many workers may fail to start before the replay is given up."""
+
+STOP_S = 5.0
+
+STEP_NS = NS_PER_S // 5
+"""Step of the clock in the silence after the drive."""
+
+MOST_CORES = 64.0
+"""Budget of a replay: what work costs does not decide what is checked."""
+
+Frame = CameraFrame | LidarFrame | EgoMotion
+
+
+class DriveClock(Clock):
+    """Shows the sensor time of the drive."""
+
+    def __init__(self, stamp_ns: int) -> None:
+        self.stamp_ns = stamp_ns
+
+    def monotonic_s(self) -> float:
+        """Sensor time, s."""
+        return self.stamp_ns / NS_PER_S
+
+    def wall_ns(self) -> int:
+        """Sensor time, ns."""
+        return self.stamp_ns
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Transition:
+    """A step of the engine that did something.
+
+    Attributes:
+        stamp_ns: sensor time of the drive.
+        event, actions: what came, and what it led to.
+        health: states of health before and after it.
+    """
+
+    stamp_ns: int
+    event: Event
+    actions: tuple[Action, ...]
+    health: tuple[str, str]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReplayedDrive:
+    """What the engine made of a drive.
+
+    Attributes:
+        decisions: in the order of sensor time.
+        transitions: steps of the engine, in their order.
+        losses: by place and cause.
+        health: state of health at the end of the drive.
+        driven_s, elapsed_s: length of the drive, and of its replay without the start of the workers, s.
+    """
+
+    decisions: tuple[Decision, ...]
+    transitions: tuple[Transition, ...]
+    losses: dict[tuple[str, str], int]
+    health: str
+    driven_s: float
+    elapsed_s: float
+
+
+class _ReplayVehicle(Vehicle):
+    """Keeps outcomes until the drive has come to their sensor time."""
+
+    def __init__(self, config: Config, rig: RigEstimator, clock: DriveClock) -> None:
+        super().__init__(config.limits, Budget(config.budget, clock.monotonic_s), rig, lambda _: None, clock=clock)
+        self._outcomes: queue.SimpleQueue[tuple[str, JobSubject, JobOutcome]] = queue.SimpleQueue()
+        self._arrived: list[tuple[str, JobSubject, JobOutcome]] = []
+
+    def post_outcome(self, receiver: str, subject: JobSubject, outcome: JobOutcome) -> None:
+        """Called on the thread of a worker."""
+        self._outcomes.put((receiver, subject, outcome))
+
+    def deliver(self, wanted: JobSubject) -> None:
+        """Posts the outcome about `wanted` if it has come; waits up to `POLL_S` for any."""
+        with suppress(queue.Empty):
+            if not any(subject == wanted for _, subject, _ in self._arrived):
+                self._arrived.append(self._outcomes.get(timeout=POLL_S))
+        for arrived in self._arrived:
+            if arrived[1] == wanted:
+                self._arrived.remove(arrived)
+                super().post_outcome(*arrived)
+                return
+
+
+class _ReplayWorkers:
+    """Worker processes in place of the one of the service: the first solves, the last checks."""
+
+    warms_up = False
+    compiled_s = 0.0
+
+    def __init__(self, config: Config, number: int) -> None:
+        self._workers = [Worker(config.worker, config.model_dump_json()) for _ in range(number)]
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """The processes are ready for jobs.
+
+        Raises:
+            SourceError: a worker cannot be used.
+        """
+        for worker in self._workers:
+            worker.start()
+        try:
+            end_s = time.monotonic() + START_S
+            for worker in self._workers:
+                while worker.warms_up or (status := worker.status()).state is WorkerState.STARTING:
+                    reason = worker.unusable or (status.failure if status.starts > ATTEMPTS else None)
+                    if reason is not None or time.monotonic() > end_s:
+                        raise SourceError("No worker became ready in time." if reason is None else reason.text)
+                    time.sleep(POLL_S)
+            yield
+        finally:
+            for worker in self._workers:
+                worker.request_stop()
+            joined([worker.thread for worker in self._workers], STOP_S)
+
+    def submit(self, job: WorkerJob) -> None:
+        """Has a job done."""
+        self._workers[-1 if job.kind is Kind.CHECK else 0].submit(job)
+
+    def prefetch(self, pair: str, frame: bytes) -> None:
+        """Announces that the depth of a frame will be needed by the next window."""
+        self._workers[0].prefetch(pair, frame)
+
+    def commissioning(self, pair: str) -> str | None:
+        """No rig is commissioned in a replay."""
+        del pair
+        return None
+
+
+class _ReplayedPair(CameraLidarPair):
+    """Notes every step that does something."""
+
+    transitions: list[Transition]
+
+    def _step(self, event: Event) -> None:
+        before = self.engine.store.state.health.value
+        actions = self.engine.step(event)
+        health = (before, self.engine.store.state.health.value)
+        idle = not actions if isinstance(event, SensorTime | FramePair) else isinstance(event, Tick)
+        if not idle or health[0] != health[1]:
+            self.transitions.append(Transition(self._context.vehicle.clock.wall_ns(), event, tuple(actions), health))
+        self._do(actions)
+
+
+class DriveReplay:
+    """The replay of one drive of one pair, in a state directory of its own."""
+
+    def __init__(self, config: Config, folder: Path, first_ns: int, workers: int) -> None:
+        """`config` has one pair. `first_ns`: stamp of the first frame. `workers`: number of worker processes.
+
+        Raises:
+            ConfigError, RecordingError: the rig cannot be built, or the folder cannot be used.
+        """
+        state = config.state.model_copy(
+            update={"directory": folder, "history": MOST_ENTRIES, "checks": MOST_CHECKS, "min_free_bytes": 0}
+        )
+        log = config.log.model_copy(update={"level": "warning"})
+        config = config.model_copy(update={"state": state, "budget": BudgetConfig(cores=MOST_CORES), "log": log})
+        self._clock = DriveClock(first_ns)
+        self._workers = _ReplayWorkers(config, workers)
+        self._disk_writer = DiskWriter(folder)
+        self._recording = RecordingThread()
+        windows = WindowStore(folder / "windows", state)
+        self._vehicle = _ReplayVehicle(config, RigEstimator(folder, (), self._disk_writer), self._clock)
+        context = VehicleContext(
+            keys=Keys(config.prefix, config.vehicle),
+            vehicle=self._vehicle,
+            store=StateStore(folder, config.vehicle),
+            disk_writer=self._disk_writer,
+            folder=windows,
+            recording=self._recording,
+            worker=cast("Worker", self._workers),
+            publish=lambda *_: None,
+            vehicle_problems=tuple,
+            show=lambda *_: None,
+            topics=RosTopicList,
+        )
+        self._transitions: list[Transition] = []
+        _ReplayedPair.transitions = self._transitions
+        self._pair = _ReplayedPair(config.pairs[0], config, context)
+
+    def run(self, frames: Iterator[Frame], on_frame: Callable[[int], None]) -> ReplayedDrive:
+        """Has the engine take all frames. `on_frame(stamp_ns)` is called for each.
+
+        Raises:
+            SourceError: a worker cannot be used, or a frame cannot be read.
+        """
+        begin_ns = self._clock.stamp_ns
+        with self._running(), self._workers.running():
+            started_s = time.monotonic()
+            for frame in frames:
+                self._clock.stamp_ns = max(self._clock.stamp_ns, frame.stamp_ns)
+                stream, payload = _packed(frame)
+                sensor = self._pair.sensors.get(stream)
+                if sensor is not None:
+                    self._vehicle.inbox.put(sensor.number, InputSample(payload, MSGPACK))
+                self._settle()
+                on_frame(frame.stamp_ns)
+            end_ns, health = self._clock.stamp_ns, self._pair.engine.store.state.health.value
+            self._fall_silent()
+            elapsed_s = time.monotonic() - started_s
+        store = self._pair.engine.store
+        return ReplayedDrive(
+            decisions_of(PairRecords(store.history.entries(), store.checks(), ())),
+            tuple(self._transitions),
+            self._pair.stream.losses(),
+            health,
+            (end_ns - begin_ns) / NS_PER_S,
+            elapsed_s,
+        )
+
+    @contextmanager
+    def _running(self) -> Iterator[None]:
+        """The threads of the disk run."""
+        self._recording.thread.start()
+        self._disk_writer.thread.start()
+        try:
+            yield
+        finally:
+            self._recording.request_stop()
+            self._disk_writer.request_stop()
+            joined([self._recording.thread, self._disk_writer.thread], STOP_S)
+
+    def _settle(self) -> None:
+        """Has the engine do all that it may, and waits for the results that it waits for."""
+        pair = self._pair
+        while self._vehicle.turn(0.0) or pair.stream.held:
+            if not pair.stream.held:
+                continue
+            if pair.engine.oldest_request is not None and pair.engine.waits(pair.stream.held.next_ns):
+                self._deliver_oldest(pair.engine.oldest_request)
+            elif not pair.recorder.has_room:
+                time.sleep(POLL_S)  # the disk is slower than the replay
+
+    def _fall_silent(self) -> None:
+        """The drive has ended: takes all results, and has the open slice end in silence, as it would in the service."""
+        engine = self._pair.engine
+        self._settle()
+        while engine.oldest_request is not None or engine.selector.slice_end_ns is not None:
+            if engine.oldest_request is not None:
+                self._deliver_oldest(engine.oldest_request)
+            else:
+                self._clock.stamp_ns += STEP_NS
+            self._settle()
+
+    def _deliver_oldest(self, request: PairRequest) -> None:
+        self._vehicle.deliver(request.subject if isinstance(request.subject, WindowSubject) else request)
+
+
+def _packed(frame: Frame) -> tuple[str, bytes]:
+    """The stream of a frame, and its native encoding."""
+    match frame:
+        case CameraFrame():
+            return CAMERA, encode_camera(frame)
+        case LidarFrame():
+            return LIDAR, encode_lidar(frame)
+        case EgoMotion():
+            return EGO, encode_ego(frame)

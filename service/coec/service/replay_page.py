@@ -1,0 +1,139 @@
+"""What a replay of a drive decided, for people to read: lines of a table, and a page."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from coec.calibration.frames.window import SliceClosed
+from coec.calibration.types import FramePair
+from coec.reports.formatting import count
+from coec.reports.page import Facts, Page, Section, Table, Text, write
+from coec.service.decision_log import Decision, Difference
+from coec.service.drive_replay import ReplayedDrive, Transition
+from coec.service.engine.messages import JobDone, RecordBetween, RecordPair, SubmitCheck, WindowSubject
+from coec.service.timing import NS_PER_S
+
+ALIKE = ("RecordPair", "RecordBetween", "Prefetch")
+"""Actions that are counted instead of listed."""
+
+
+@dataclass(frozen=True, slots=True)
+class OutlineLine:
+    """A decision as a line; `time` is in seconds of the drive."""
+
+    time: str
+    kind: str
+    name: str
+    text: str
+
+
+def outline(decisions: Sequence[Decision], first_ns: int) -> Iterator[OutlineLine]:
+    """The decisions of a drive that begins at `first_ns`; checks that say what the one before them said are counted."""
+    before, repeated = "", 0
+    for decision in decisions:
+        if decision.kind == "check" and decision.name == before:
+            repeated += 1
+            continue
+        if repeated:
+            yield OutlineLine("", "check", before, f"{count(repeated, 'more check')}")
+            repeated = 0
+        before = decision.name if decision.kind == "check" else before
+        seconds = f"{(decision.stamp_ns - first_ns) / NS_PER_S:.1f}"
+        yield OutlineLine(seconds, decision.kind, decision.name, _text(decision))
+    if repeated:
+        yield OutlineLine("", "check", before, f"{count(repeated, 'more check')}")
+
+
+def _text(decision: Decision) -> str:
+    values = decision.values
+    match decision.kind:
+        case "check":
+            return f"evidence {values['evidence']:.1f}, {'flagged' if values['flagged'] else 'not flagged'}"
+        case "estimate":
+            sigma = [value for value in values["sigma"][:3] if value is not None]
+            reasons = " ".join(reason["text"] for reason in values["verdict"]["reasons"])
+            text = f"{values['window_id']}, {values['pairs']} pairs"
+            return f"{text}, σ {max(sigma):.2f}°. {reasons}" if sigma else f"{text}. {reasons}"
+        case "extrinsic":
+            return "" if values["window_id"] is None else f"by {values['window_id']}"
+        case _:
+            return ""
+
+
+def transition_text(transition: Transition) -> tuple[str, str]:
+    """An event and its actions, in words."""
+    return _event_text(transition.event), ", ".join(_action_texts(transition.actions)) or "none"
+
+
+def _event_text(event: Any) -> str:
+    match event:
+        case FramePair():
+            return "frame pair"
+        case JobDone(subject=WindowSubject() as subject):
+            return f"window {subject.window_id} solved: {event.outcome.fate.value}"
+        case JobDone():
+            return f"job ended: {event.outcome.fate.value}"
+        case _:
+            return type(event).__name__
+
+
+def _action_texts(actions: Sequence[Any]) -> Iterator[str]:
+    for action in actions:
+        match action:
+            case RecordPair() | RecordBetween():
+                yield f"{type(action).__name__} for {action.window_id}"
+            case SliceClosed():
+                yield f"end of {action.window_id} with {count(action.pairs, 'pair')}"
+            case SubmitCheck():
+                yield f"check of {count(len(action.pairs), 'pair')}, counts from {action.request.due_ns} ns"
+            case _:
+                yield type(action).__name__
+
+
+def write_replay_page(
+    path: Path, name: str, replayed: ReplayedDrive, first_ns: int, found: Sequence[Difference] | None
+) -> None:
+    """Writes a page with the decisions of a drive and, if they were compared, what differs.
+
+    Raises:
+        RecordingError: the file cannot be written.
+    """
+    rows = [(line.time, line.kind, line.name, line.text) for line in outline(replayed.decisions, first_ns)]
+    sections = [
+        Section("Decisions", (Table("In the order of sensor time.", HEADS, rows, frozenset({0}), frozenset({3})),))
+    ]
+    if found is not None:
+        sections.insert(0, Section("Differences", (_differences(found, first_ns),)))
+    losses = tuple((f"{place}, {cause}", str(number)) for (place, cause), number in sorted(replayed.losses.items()))
+    if losses:
+        sections.append(Section("Losses", (Facts(losses),)))
+    facts = Facts(
+        (
+            ("Length of the drive", f"{replayed.driven_s:.0f} s"),
+            ("Health at the end", replayed.health),
+            ("Checks", str(sum(one.kind == "check" for one in replayed.decisions))),
+            ("Windows", str(sum(one.kind == "estimate" for one in replayed.decisions))),
+        )
+    )
+    write(path, Page("Replay of a drive", name, (facts,), tuple(sections)))
+
+
+HEADS = ("Time, s", "Decision", "Outcome", "Details")
+
+
+def _differences(found: Sequence[Difference], first_ns: int) -> Table | Text:
+    if not found:
+        return Text(("The decisions are equal.",))
+    rows = [
+        (
+            f"{(one.either.stamp_ns - first_ns) / NS_PER_S:.1f}",
+            one.either.kind,
+            "none" if one.before is None else one.before.name,
+            "none" if one.after is None else one.after.name,
+            ", ".join(one.fields),
+        )
+        for one in found
+    ]
+    heads = ("Time, s", "Decision", "There", "Here", "Values that differ")
+    return Table("Decisions that differ.", heads, rows, frozenset({0}), frozenset({4}))
