@@ -223,7 +223,10 @@ def _show_drive(
 
     log, against, report = files
     first_ns = recording.camera_stamps_ns[0]
-    found = () if against is None else differences(read_log(against, pair), replayed.decisions)
+    found: tuple[Difference, ...] = ()
+    if against is not None:
+        there = [one for one in read_log(against, pair) if replayed.begin_ns <= one.stamp_ns <= replayed.end_ns]
+        found = differences(there, replayed.decisions)
     if log is not None:
         write_log(log, replayed.decisions)
     if report is not None:
@@ -233,10 +236,10 @@ def _show_drive(
     if as_json:
         console.print_json(_document(replayed, None if against is None else found))
         return 1 if found else 0
-    if explain_s is not None:
+    if explain_s is None:
+        _table(replayed, first_ns)
+    else:
         _explain(replayed, first_ns, explain_s)
-        return 1 if found else 0
-    _table(replayed, first_ns)
     if against is not None:
         _show_differences(found, against, first_ns)
     return 1 if found else 0
@@ -286,7 +289,8 @@ def _table(replayed: ReplayedDrive, first_ns: int) -> None:
     pace = replayed.driven_s / max(replayed.elapsed_s, 1e-9)
     console.show(
         f"{count(len(checks), 'check')}, {count(len(windows), 'window')}, {count(lost, 'loss', 'losses')}, "
-        f"{replayed.health} at the end; {replayed.driven_s:.0f} s of driving in {replayed.elapsed_s:.0f} s ({pace:.1f} times as fast)"
+        f"{replayed.health} at the end; {replayed.driven_s:.0f} s of driving in {replayed.elapsed_s:.0f} s "
+        f"({pace:.1f} times as fast)"
     )
 
 

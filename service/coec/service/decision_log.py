@@ -67,7 +67,7 @@ def _decisions(records: PairRecords) -> Iterator[Decision]:
         if record.result is not None:
             yield Decision("estimate", entry.stamp_ns, entry.code, record.result.model_dump(mode="json"))
         elif entry.kind in ("extrinsic", "state"):
-            pose = None if entry.camera_from_lidar is None else entry.camera_from_lidar.matrix
+            pose = None if entry.camera_from_lidar is None else entry.camera_from_lidar.model_dump(mode="json")
             values = {"code": entry.code, "window_id": entry.window_id, "camera_from_lidar": pose}
             yield Decision(entry.kind, entry.stamp_ns, entry.code, values)
 

@@ -52,9 +52,6 @@ ATTEMPTS = 3
 
 STOP_S = 5.0
 
-STEP_NS = NS_PER_S // 5
-"""Step of the clock in the silence after the drive."""
-
 MOST_CORES = 64.0
 """Budget of a replay: what work costs does not decide what is checked."""
 
@@ -101,15 +98,22 @@ class ReplayedDrive:
         transitions: steps of the engine, in their order.
         losses: by place and cause.
         health: state of health at the end of the drive.
-        driven_s, elapsed_s: length of the drive, and of its replay without the start of the workers, s.
+        begin_ns, end_ns: stamps of the first and the last frame.
+        elapsed_s: time of the replay without the start of the workers, s.
     """
 
     decisions: tuple[Decision, ...]
     transitions: tuple[Transition, ...]
     losses: dict[tuple[str, str], int]
     health: str
-    driven_s: float
+    begin_ns: int
+    end_ns: int
     elapsed_s: float
+
+    @property
+    def driven_s(self) -> float:
+        """Length of the drive, s."""
+        return (self.end_ns - self.begin_ns) / NS_PER_S
 
 
 class _ReplayVehicle(Vehicle):
@@ -196,6 +200,12 @@ class _ReplayedPair(CameraLidarPair):
             self.transitions.append(Transition(self._context.vehicle.clock.wall_ns(), event, tuple(actions), health))
         self._do(actions)
 
+    def end_slice(self) -> None:
+        """Sensor time has come to the end of the open slice."""
+        end_ns = self.engine.selector.slice_end_ns
+        if end_ns is not None:
+            self._step(SensorTime(end_ns))
+
 
 class DriveReplay:
     """The replay of one drive of one pair, in a state directory of its own."""
@@ -252,7 +262,7 @@ class DriveReplay:
                 self._settle()
                 on_frame(frame.stamp_ns)
             end_ns, health = self._clock.stamp_ns, self._pair.engine.store.state.health.value
-            self._fall_silent()
+            self._finish()
             elapsed_s = time.monotonic() - started_s
         store = self._pair.engine.store
         return ReplayedDrive(
@@ -260,7 +270,8 @@ class DriveReplay:
             tuple(self._transitions),
             self._pair.stream.losses(),
             health,
-            (end_ns - begin_ns) / NS_PER_S,
+            begin_ns,
+            end_ns,
             elapsed_s,
         )
 
@@ -287,15 +298,16 @@ class DriveReplay:
             elif not pair.recorder.has_room:
                 time.sleep(POLL_S)  # the disk is slower than the replay
 
-    def _fall_silent(self) -> None:
-        """The drive has ended: takes all results, and has the open slice end in silence, as it would in the service."""
-        engine = self._pair.engine
+    def _finish(self) -> None:
+        """The drive has ended: takes all results, and ends the open slice at its end, as silence would in the
+        service."""
+        pair = self._pair
+        pair.stream.flush()
         self._settle()
-        while engine.oldest_request is not None or engine.selector.slice_end_ns is not None:
-            if engine.oldest_request is not None:
-                self._deliver_oldest(engine.oldest_request)
-            else:
-                self._clock.stamp_ns += STEP_NS
+        while pair.engine.oldest_request is not None or pair.engine.selector.slice_end_ns is not None:
+            pair.end_slice()
+            if pair.engine.oldest_request is not None:
+                self._deliver_oldest(pair.engine.oldest_request)
             self._settle()
 
     def _deliver_oldest(self, request: PairRequest) -> None:

@@ -1,5 +1,6 @@
 """What a replay of a drive decided, for people to read: lines of a table, and a page."""
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +14,6 @@ from coec.service.decision_log import Decision, Difference
 from coec.service.drive_replay import ReplayedDrive, Transition
 from coec.service.engine.messages import JobDone, RecordBetween, RecordPair, SubmitCheck, WindowSubject
 from coec.service.timing import NS_PER_S
-
-ALIKE = ("RecordPair", "RecordBetween", "Prefetch")
-"""Actions that are counted instead of listed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,20 +73,25 @@ def _event_text(event: Any) -> str:
         case JobDone():
             return f"job ended: {event.outcome.fate.value}"
         case _:
-            return type(event).__name__
+            return _words(event)
+
+
+def _words(value: object) -> str:
+    """The name of a type in words: `RecordPair` is `record pair`."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(value).__name__).lower()
 
 
 def _action_texts(actions: Sequence[Any]) -> Iterator[str]:
     for action in actions:
         match action:
             case RecordPair() | RecordBetween():
-                yield f"{type(action).__name__} for {action.window_id}"
+                yield f"{_words(action)} for {action.window_id}"
             case SliceClosed():
                 yield f"end of {action.window_id} with {count(action.pairs, 'pair')}"
             case SubmitCheck():
                 yield f"check of {count(len(action.pairs), 'pair')}, counts from {action.request.due_ns} ns"
             case _:
-                yield type(action).__name__
+                yield _words(action)
 
 
 def write_replay_page(

@@ -1,0 +1,154 @@
+"""A drive is replayed through the engine: the same decisions however its workers dawdle, and a log that says them."""
+
+from __future__ import annotations
+
+import json
+import random
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import pytest
+
+from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
+from coec.config import Config
+from coec.errors import SourceError
+from coec.service import camera_lidar_pair as runtime_pair
+from coec.service import drive_replay
+from coec.service.decision_log import Decision, differences, read_log, write_log
+from coec.service.drive_replay import DriveReplay, ReplayedDrive
+from coec.service.replay_page import outline, transition_text, write_replay_page
+from coec.service.worker.worker_jobs import WorkerJob
+from service.test_pair_disturbed import streams
+from support.vehicles import BEGIN_S, NS_PER_S, STEP_S, InstantRecorder, OracleWorker, PairBench, pair_configuration
+
+PAIR = "front"
+
+
+class Dawdling:
+    """Worker processes that know the truth, and answer out of order on threads of their own."""
+
+    warms_up = False
+    compiled_s = 0.0
+    seed = 0
+
+    def __init__(self, config: Config, number: int) -> None:
+        del config, number
+        self.oracle = OracleWorker()
+        self.rng = random.Random(self.seed)
+        self.threads: list[threading.Thread] = []
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        yield
+        for thread in self.threads:
+            thread.join()
+
+    def submit(self, job: WorkerJob) -> None:
+        thread = threading.Timer(0.002 * self.rng.random(), self.oracle.submit, (job,))
+        self.threads.append(thread)
+        thread.start()
+
+    def prefetch(self, pair: str, frame: bytes) -> None:
+        """Nothing is inferred."""
+
+    def commissioning(self, pair: str) -> str | None:
+        del pair
+        return None
+
+
+def replayed(folder: Path, monkeypatch: pytest.MonkeyPatch, seed: int = 0) -> ReplayedDrive:
+    frames: list[CameraFrame | LidarFrame | EgoMotion] = sorted(
+        (frame for stream in streams().values() for frame in stream), key=lambda frame: frame.stamp_ns
+    )
+    folder.mkdir()
+    monkeypatch.setattr(Dawdling, "seed", seed)
+    monkeypatch.setattr(drive_replay, "_ReplayWorkers", Dawdling)
+    monkeypatch.setattr(runtime_pair, "Recorder", InstantRecorder)
+    drive = DriveReplay(pair_configuration(folder), folder, frames[0].stamp_ns, 1)
+    cast("InstantRecorder", drive._pair.recorder).worker = cast("Dawdling", drive._workers).oracle
+    return drive.run(iter(frames), lambda _: None)
+
+
+@pytest.mark.fault("a replay whose workers answer late and out of order", "the same decisions, to the byte")
+def test_the_decisions_of_a_drive_do_not_depend_on_the_workers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record_property: pytest.RecordProperty
+) -> None:
+    drives = [replayed(tmp_path / str(seed), monkeypatch, seed) for seed in range(2)]
+    logs = [[decision.line() for decision in drive.decisions] for drive in drives]
+    assert logs[0] == logs[1]
+    record_property("figure", f"{len(logs[0])} decisions, all equal")
+    kinds = {decision.kind for decision in drives[0].decisions}
+    assert kinds == {"check", "estimate", "extrinsic", "state"}
+    states = [decision.name for decision in drives[0].decisions if decision.kind == "state"]
+    assert [name for name in states if name != "unknown"] == ["healthy", "suspect", "miscalibrated", "healthy"]
+    assert drives[0].health == "healthy"
+    assert drives[0].driven_s == pytest.approx(200.0, abs=1.0)
+
+
+def test_a_log_is_read_as_it_was_written_and_that_of_a_vehicle_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drive = replayed(tmp_path / "replay", monkeypatch)
+    write_log(tmp_path / "log.jsonl", drive.decisions)
+    assert differences(read_log(tmp_path / "log.jsonl", PAIR), drive.decisions) == ()
+    bench = PairBench(tmp_path / "live")
+    bench.drive(BEGIN_S, BEGIN_S + 60)
+    vehicle = read_log(tmp_path / "live", PAIR)
+    assert {decision.kind for decision in vehicle} == {"check", "estimate", "extrinsic", "state"}
+    files = sorted(path.name for path in (tmp_path / "live").iterdir())
+    with pytest.raises(SourceError, match="no records of a pair rear"):
+        read_log(tmp_path / "live", "rear")
+    assert files == sorted(path.name for path in (tmp_path / "live").iterdir()), "it is only read"
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{}\n", "[1]\n", '{"kind": "check"}\n', "\x00\xff", '{"kind":1,"stamp_ns":"x"}\n']
+)
+def test_what_is_no_log_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "log.jsonl"
+    path.write_text(text, encoding="latin-1")
+    if not text:
+        assert read_log(path, PAIR) == ()
+        return
+    with pytest.raises(SourceError, match="is no log of decisions"):
+        read_log(path, PAIR)
+    with pytest.raises(SourceError, match="cannot be read"):
+        read_log(tmp_path / "none", PAIR)
+
+
+def test_differences_name_what_differs_where() -> None:
+    def check(stamp_ns: int, evidence: float) -> Decision:
+        return Decision("check", stamp_ns, "clear", {"evidence": evidence, "metrics": {"mi": 1.0}})
+
+    before = (check(1, 0.0), check(2, 0.0), Decision("state", 2, "healthy", {"code": "healthy"}))
+    after = (check(1, 0.0), check(2, 0.5), check(3, 0.0))
+    found = differences(before, after)
+    assert [(one.either.kind, one.either.stamp_ns, one.fields) for one in found] == [
+        ("check", 2, ("evidence",)),
+        ("state", 2, ()),
+        ("check", 3, ()),
+    ]
+    assert [one.before is None for one in found] == [False, False, True]
+    assert [one.after is None for one in found] == [False, True, False]
+
+
+def test_people_read_the_outline_the_steps_and_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = replayed(tmp_path / "replay", monkeypatch)
+    lines = list(outline(drive.decisions, drive.begin_ns))
+    assert len(lines) < len(drive.decisions), "checks that say the same are counted"
+    assert any("more check" in line.text for line in lines)
+    moved_s = STEP_S - BEGIN_S
+    around = [one for one in drive.transitions if abs((one.stamp_ns - drive.begin_ns) / NS_PER_S - moved_s) < 20.0]
+    events, actions = zip(*(transition_text(one) for one in around), strict=True)
+    assert {"frame pair", "job ended: result"} <= set(events)
+    assert any("check of 5 pairs, counts from" in text for text in actions)
+    write_replay_page(tmp_path / "page.html", "drive", drive, drive.begin_ns, ())
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "The decisions are equal." in page
+    assert "miscalibrated" in page
+    assert json.loads(drive.decisions[0].line())["kind"] in ("check", "state")
+    assert np.isfinite(drive.elapsed_s)
