@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -200,8 +199,11 @@ def _replay_drive(recording: RecordingSource, config: Config, begin_s: float, un
         raise UsageError(f"no camera frame lies between --from and --until: {recording.name} is shorter")
 
     def frames() -> Iterator[SensorMessage]:
-        for frame in takewhile(lambda frame: frame.stamp_ns <= end_ns, recording.messages()):
-            if frame.stamp_ns >= begin_ns:
+        # Motion before the first image and after the last one belongs to them.
+        for frame in recording.messages():
+            if until_s is not None and frame.stamp_ns > end_ns:
+                return
+            if begin_s == 0.0 or frame.stamp_ns >= begin_ns:
                 yield frame
 
     with TemporaryDirectory() as folder, console.progress() as bars:
