@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import random
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import cast
@@ -75,7 +75,7 @@ def replayed(folder: Path, monkeypatch: pytest.MonkeyPatch, seed: int = 0) -> Re
 
 @pytest.mark.fault("a replay whose workers answer late and out of order", "the same decisions, to the byte")
 def test_the_decisions_of_a_drive_do_not_depend_on_the_workers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record_property: pytest.RecordProperty
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record_property: Callable[[str, object], None]
 ) -> None:
     drives = [replayed(tmp_path / str(seed), monkeypatch, seed) for seed in range(2)]
     logs = [[decision.line() for decision in drive.decisions] for drive in drives]

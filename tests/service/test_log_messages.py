@@ -98,7 +98,7 @@ def test_the_stream_does_not_wait_for_a_worker_that_compiles_its_kernels(tmp_pat
     def drive(begin_s: int, end_s: int) -> None:
         for stamp_ns in range(begin_s * NS_PER_S, end_s * NS_PER_S, NS_PER_S // 2):
             bench.hold(frame_pair_at(stamp_ns))
-            while bench.pair.advance():
+            while bench.pair.advance(bench.clock.monotonic_s()):
                 pass
 
     drive(BEGIN_S, BEGIN_S + 60)

@@ -146,13 +146,13 @@ def test_a_stream_that_has_waited_for_too_long_goes_on_and_says_so(tmp_path: Pat
     bench = PairBench(tmp_path / "state", worker=SlowWorker)
     for stamp_ns in range(BEGIN_S * NS_PER_S, (BEGIN_S + 60) * NS_PER_S, NS_PER_S // 2):
         bench.hold(frame_pair_at(stamp_ns))
-        while bench.pair.advance():
+        while bench.pair.advance(bench.clock.monotonic_s()):
             pass
     waiting = len(bench.pair.stream.held)
     assert waiting > 0
     assert ("monitor", "not_awaited") not in bench.losses
     bench.vehicle.waiting_frames._max_bytes = 0
-    while bench.pair.advance():
+    while bench.pair.advance(bench.clock.monotonic_s()):
         pass
     assert len(bench.pair.stream.held) == 0
     assert bench.losses["monitor", "not_awaited"] == waiting

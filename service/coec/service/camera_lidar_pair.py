@@ -19,6 +19,7 @@ from coec.service.engine.frame_selector import FrameSelector
 from coec.service.engine.messages import (
     Action,
     CommissioningSubject,
+    Evaluate,
     Event,
     JobDone,
     KeepSnippet,
@@ -150,25 +151,22 @@ class CameraLidarPair:
             self._context.folder.release(event.window_id)  # which its job holds by now
         return None
 
-    def advance(self) -> bool:
+    def advance(self, now_s: float) -> bool:
         """Evaluates the oldest frame pair if it may be evaluated: every result that counts before it has come and the
         recorder has room; or it has waited too long, or too many frames wait. Returns whether it did."""
-        now_s = self._context.vehicle.clock.monotonic_s()
         if self.engine.needs_tick(now_s):
             self._tick()
-        if not self.stream.held:
+        stamp_ns = self.stream.next_ns
+        if stamp_ns is None:
             return False
         self.engine.warms_up = self._context.worker.warms_up
-        stamp_ns = self.stream.held.next_ns
-        if self.recorder.has_room:
-            self._step(SensorTime(stamp_ns))
-            if not self.engine.waits(stamp_ns):
-                self.stream.held.stop_waiting()
-                self._step(self.stream.take())
-                return True
-        if not self.stream.held.has_waited(now_s):
+        self._step(SensorTime(stamp_ns))
+        is_forced = not self.recorder.has_room or self.engine.waits(stamp_ns)
+        if not is_forced:
+            self.stream.held.stop_waiting()
+        elif not self.stream.held.has_waited(now_s):
             return False
-        self._step(self.stream.take())
+        self._step(Evaluate(self.stream.take(), is_forced))
         return True
 
     def tick(self, *, waiting: bool) -> None:
@@ -186,8 +184,9 @@ class CameraLidarPair:
     def finish_pairs(self) -> None:
         """Evaluates every frame pair that has come, even if it should wait for a result."""
         self.stream.flush()
-        while self.stream.held:
-            self._step(self.stream.take())
+        while (stamp_ns := self.stream.next_ns) is not None:
+            self._step(SensorTime(stamp_ns))
+            self._step(Evaluate(self.stream.take(), is_forced=True))
 
     def finish_window(self) -> None:
         """Ends the open window when the service ends; called after the thread of the engine has ended."""

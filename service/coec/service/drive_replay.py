@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
-from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame
+from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import BudgetConfig, Config
 from coec.errors import SourceError
 from coec.io.disk_writer import DiskWriter
@@ -27,7 +27,16 @@ from coec.schemas.keys import Keys
 from coec.service.camera_lidar_pair import CameraLidarPair
 from coec.service.cpu_budget import Budget
 from coec.service.decision_log import MOST_CHECKS, MOST_ENTRIES, Decision, decisions_of
-from coec.service.engine.messages import Action, Event, JobSubject, PairRequest, SensorTime, Tick, WindowSubject
+from coec.service.engine.messages import (
+    Action,
+    Evaluate,
+    Event,
+    JobSubject,
+    PairRequest,
+    SensorTime,
+    Tick,
+    WindowSubject,
+)
 from coec.service.engine.rig import RigEstimator
 from coec.service.engine.vehicle import Vehicle
 from coec.service.ingest.decoder import CAMERA, EGO, LIDAR
@@ -195,7 +204,7 @@ class _ReplayedPair(CameraLidarPair):
         before = self.engine.store.state.health.value
         actions = self.engine.step(event)
         health = (before, self.engine.store.state.health.value)
-        idle = not actions if isinstance(event, SensorTime | FramePair) else isinstance(event, Tick)
+        idle = not actions if isinstance(event, SensorTime | Evaluate) else isinstance(event, Tick)
         if not idle or health[0] != health[1]:
             self.transitions.append(Transition(self._context.vehicle.clock.wall_ns(), event, tuple(actions), health))
         self._do(actions)

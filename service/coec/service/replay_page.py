@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from coec.calibration.frames.window import SliceClosed
-from coec.calibration.types import FramePair
 from coec.reports.formatting import count
 from coec.reports.page import Facts, Page, Section, Table, Text, write
 from coec.service.decision_log import Decision, Difference
 from coec.service.drive_replay import ReplayedDrive, Transition
-from coec.service.engine.messages import JobDone, RecordBetween, RecordPair, SubmitCheck, WindowSubject
+from coec.service.engine.messages import Evaluate, JobDone, RecordBetween, RecordPair, SubmitCheck, WindowSubject
 from coec.service.timing import NS_PER_S
 
 
@@ -66,7 +65,7 @@ def transition_text(transition: Transition) -> tuple[str, str]:
 
 def _event_text(event: Any) -> str:
     match event:
-        case FramePair():
+        case Evaluate():
             return "frame pair"
         case JobDone(subject=WindowSubject() as subject):
             return f"window {subject.window_id} solved: {event.outcome.fate.value}"

@@ -22,7 +22,7 @@ from coec.io.msgpack_frames import encode_camera, encode_ego, encode_lidar
 from coec.io.zenoh.bus import InputSample
 from coec.service.camera_lidar_pair import CameraLidarPair
 from coec.service.cpu_budget import Budget
-from coec.service.engine.messages import Action, Event, SelectionStatistics, SensorTime
+from coec.service.engine.messages import Action, Evaluate, Event, SelectionStatistics, SensorTime
 from coec.service.engine.pair import Pair
 from coec.service.engine.pair_stream import PairStream
 from coec.service.engine.rig import RigEstimator
@@ -81,10 +81,10 @@ class Observations:
         return self.is_waiting
 
     def step(self, event: Event) -> list[Action]:
-        if isinstance(event, FramePair):
-            self.statistics = replace(self.statistics, last_ns=event.stamp_ns)
+        if isinstance(event, Evaluate):
+            self.statistics = replace(self.statistics, last_ns=event.pair.stamp_ns)
             if self.keeps:
-                self.pairs.append(event)
+                self.pairs.append(event.pair)
         elif isinstance(event, SensorTime) and event.stamp_ns == self.slice_end_ns:
             self.finished.append(event.stamp_ns)
             self.slice_end_ns = None

@@ -266,9 +266,10 @@ class LidarPairStream:
 
     # --- turns ------------------------------------------------------------------------------------------------------
 
-    def advance(self) -> bool:
+    def advance(self, now_s: float) -> bool:
         """Requests the oldest waiting registration, or leaves it out. Returns whether it could: a result that counts
         before it may be missing, or the budget refuses it until the streams have gone on."""
+        del now_s
         if not self._sweep_sets or self._tried_ns == self._sampler.latest_ns:
             return False
         sweep_set = self._sweep_sets[0]

@@ -175,10 +175,18 @@ JobSubject = Request[Any, Any, Any] | WindowSubject | PictureSubject | Commissio
 
 @dataclass(frozen=True, slots=True)
 class SensorTime:
-    """The streams of the pair have come to this sensor time; `FramePair`, the event that may follow, has a stamp of
-    it."""
+    """The streams of the pair have come to this sensor time."""
 
     stamp_ns: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evaluate:
+    """The next frame pair is to be evaluated, after `SensorTime` of its stamp. `is_forced`: although a result that
+    counts before it is missing, because it cannot wait longer."""
+
+    pair: FramePair
+    is_forced: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -212,8 +220,8 @@ class Reconfigured:
     history_text: str
 
 
-Event = FramePair | SensorTime | JobDone | WindowRecorded | WindowLost | Tick | Reconfigured
-"""What comes into a pair; a `FramePair` is to be evaluated."""
+Event = SensorTime | Evaluate | JobDone | WindowRecorded | WindowLost | Tick | Reconfigured
+"""What comes into a pair."""
 
 # --- actions --------------------------------------------------------------------------------------------------------
 

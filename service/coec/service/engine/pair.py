@@ -33,6 +33,7 @@ from coec.service.engine.messages import (
     Action,
     CheckSubject,
     CommissioningSubject,
+    Evaluate,
     Event,
     JobDone,
     KeepSnippet,
@@ -186,8 +187,8 @@ class Pair:
         match event:
             case SensorTime():
                 self._advance(event.stamp_ns)
-            case FramePair():
-                self._evaluate(event)
+            case Evaluate():
+                self._evaluate(event.pair, is_forced=event.is_forced)
             case JobDone():
                 self._on_job(event)
             case WindowRecorded():
@@ -232,9 +233,8 @@ class Pair:
     def _waits_for_results(self, stamp_ns: int) -> bool:
         return self._schedule.waits(stamp_ns) and not self.warms_up
 
-    def _evaluate(self, pair: FramePair) -> None:
-        self._advance(pair.stamp_ns)
-        if self.waits(pair.stamp_ns):
+    def _evaluate(self, pair: FramePair, *, is_forced: bool) -> None:
+        if is_forced and self.waits(pair.stamp_ns):
             self._losses.add("monitor", "not_awaited")
         steps_back = self.selector.is_step_back(pair.stamp_ns)
         if steps_back:

@@ -88,6 +88,11 @@ class PairStream:
             self._sync_error_s = (pair.camera.stamp_ns - pair.lidar.stamp_ns) / NS_PER_S
             self.held.add(pair)
 
+    @property
+    def next_ns(self) -> int | None:
+        """Stamp of the oldest frame pair that waits; None if none does."""
+        return self.held.next_ns if self._received_s else None
+
     def take(self) -> FramePair:
         """Takes out the oldest frame pair."""
         self.waiting_took.add(self._vehicle.clock.monotonic_s() - self._received_s.popleft())

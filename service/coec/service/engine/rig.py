@@ -326,6 +326,7 @@ class RigEstimator:
 
     Attributes:
         snapshot: what is known; replaced whenever it has changed, and never changed itself.
+        has_news: something has come since `take_report` last had nothing to take.
     """
 
     def __init__(self, folder: Path, links: Sequence[LinkConfig], disk_writer: DiskWriter) -> None:
@@ -350,6 +351,7 @@ class RigEstimator:
         self._losses: Counter[str] = Counter({"state_damaged": len(self._file.damage)} if self._file.damage else {})
         self._saved_ns = NEVER_NS
         self.snapshot = RigSnapshot(losses=dict(self._losses))
+        self.has_news = True
 
     # --- on any thread ----------------------------------------------------------------------------------------------
 
@@ -361,6 +363,7 @@ class RigEstimator:
             if accepted is None
             else EdgeWindow(Measurement.from_estimate(accepted), start_ns_of(accepted.window_id))
         )
+        self.has_news = True
         self._joining.append((pair.name, _Joined(pair, nominal, served_by(state, prior_sigma(pair.tracker)), window)))
         return RigMember(pair, self)
 
@@ -368,6 +371,7 @@ class RigEstimator:
         """Adds two LiDARs of pairs that have joined, whether they are registered or not. The name of their edge stands
         for them. The edge belongs to the rig once a registration has measured it."""
         self._joining.append((known.edge.name, known))
+        self.has_news = True
 
     # --- reports ----------------------------------------------------------------------------------------------------
 
@@ -379,13 +383,14 @@ class RigEstimator:
                 return
             due_ns = None  # there is no other pair whose report it could overtake
         self._schedule.put(pair, due_ns, report)
+        self.has_news = True
 
     def report_time(self, pair: str, stamp_ns: int, *, waits: bool) -> None:
         """A pair has frames of this sensor time. If it `waits`, results of its own requests are missing; else it has
         made all its reports up to there."""
         self._admit()
         if self._members >= 2:
-            self._quiet_ticks = 0
+            self._quiet_ticks, self.has_news = 0, True
             self._schedule.report_time(pair, stamp_ns, waits=waits)
 
     def waits(self, stamp_ns: int) -> bool:
@@ -397,6 +402,7 @@ class RigEstimator:
         if self._members < 2:
             return
         self._schedule.step_back(stamp_ns, _SteppedBack())
+        self.has_news = True
         for waiting in self._corrections.values():
             waiting.clear()
         self._window_requests.clear()
@@ -423,6 +429,7 @@ class RigEstimator:
     def tick(self) -> None:
         """A second has passed."""
         self._quiet_ticks += 1
+        self.has_news = True
 
     @property
     def is_quiet(self) -> bool:
@@ -433,7 +440,8 @@ class RigEstimator:
         """Takes the next report; returns whether one could be taken. `all_are_silent`: nothing earlier can come,
         because the streams have stopped and every request is answered."""
         self._admit()
-        return self._take_one(silent=all_are_silent)
+        self.has_news = self._take_one(silent=all_are_silent)
+        return self.has_news
 
     def finish(self) -> None:
         """Takes all reports in their order, and saves what is known; for the end of the service."""

@@ -62,8 +62,8 @@ class Receiver(Protocol):
     def on_event(self, event: Any) -> object:
         """Takes an event; returns the reply, if somebody waits for one."""
 
-    def advance(self) -> bool:
-        """Evaluates the next frames if nothing is missing before; returns whether it did."""
+    def advance(self, now_s: float) -> bool:
+        """Evaluates the next frames if nothing is missing before; returns whether it did. `now_s`: steady clock."""
 
     def tick(self, *, waiting: bool) -> None:
         """Time has passed; `waiting`: samples of its streams are in the inbox."""
@@ -171,12 +171,12 @@ class Vehicle:
         elif item is not None:
             self._deliver(item)
         self._is_busy = False
+        now_s = self.clock.monotonic_s()
         for receiver in self._receivers.values():
-            self._is_busy |= receiver.advance()
-        while self.rig.take_report(all_are_silent=self.rig.is_quiet and self.unanswered == 0):
+            self._is_busy |= receiver.advance(now_s)
+        while self.rig.has_news and self.rig.take_report(all_are_silent=self.rig.is_quiet and self.unanswered == 0):
             self._is_busy = True
             self._on_rig(self.rig.snapshot)
-        now_s = self.clock.monotonic_s()
         if now_s - self._ticked_s >= TICK_S:
             self._tick(now_s)
         return item is not None or self._is_busy
