@@ -143,14 +143,14 @@ class Difference:
 def differences(before: Sequence[Decision], after: Sequence[Decision]) -> tuple[Difference, ...]:
     """What differs between two logs, in the order of sensor time. Decisions of one kind and stamp belong together."""
     keyed_before, keyed_after = _keyed(before), _keyed(after)
-    found = []
+    result = []
     for key in sorted(keyed_before.keys() | keyed_after.keys()):
         one, other = keyed_before.get(key), keyed_after.get(key)
         if one is None or other is None:
-            found.append(Difference(one, other))
+            result.append(Difference(one, other))
         elif one.values != other.values:
-            found.append(Difference(one, other, tuple(_places(one.values, other.values))))
-    return tuple(found)
+            result.append(Difference(one, other, tuple(_places(one.values, other.values))))
+    return tuple(result)
 
 
 def _keyed(decisions: Sequence[Decision]) -> dict[tuple[int, int, int], Decision]:

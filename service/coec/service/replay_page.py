@@ -72,10 +72,10 @@ def _event_text(event: Any) -> str:
         case JobDone():
             return f"job ended: {event.outcome.fate.value}"
         case _:
-            return _words(event)
+            return _type_label(event)
 
 
-def _words(value: object) -> str:
+def _type_label(value: object) -> str:
     """The name of a type in words: `RecordPair` is `record pair`."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(value).__name__).lower()
 
@@ -84,13 +84,13 @@ def _action_texts(actions: Sequence[Any]) -> Iterator[str]:
     for action in actions:
         match action:
             case RecordPair() | RecordBetween():
-                yield f"{_words(action)} for {action.window_id}"
+                yield f"{_type_label(action)} for {action.window_id}"
             case SliceClosed():
                 yield f"end of {action.window_id} with {count(action.pairs, 'pair')}"
             case SubmitCheck():
                 yield f"check of {count(len(action.pairs), 'pair')}, counts from {action.request.due_ns} ns"
             case _:
-                yield _words(action)
+                yield _type_label(action)
 
 
 def write_replay_page(

@@ -48,13 +48,13 @@ def test_events_come_before_samples_in_the_order_in_which_they_were_posted() -> 
 @pytest.mark.fault("a flood of `calibrate`", "it is refused, and pairing is not held up")
 def test_a_flood_of_commands_is_refused_and_outcomes_are_not_held_up() -> None:
     inbox = Inbox({}, 0, lambda _: None)
-    asking = [threading.Thread(target=inbox.ask, args=("front", "command", 30.0)) for _ in range(COMMANDS_WAITING)]
+    asking = [threading.Thread(target=inbox.request, args=("front", "command", 30.0)) for _ in range(COMMANDS_WAITING)]
     for thread in asking:
         thread.start()
     while inbox._commands["front"] < COMMANDS_WAITING:
         threading.Event().wait(0.001)
     with pytest.raises(BusyError, match="Too many commands"):
-        inbox.ask("front", "command", 30.0)
+        inbox.request("front", "command", 30.0)
     inbox.post("front", "outcome")
     taken = []
     while (posted := inbox.take_posted()) is not None:

@@ -128,7 +128,7 @@ class Commands:
                 text = f"You give commands faster than {PER_S:g} per second; nothing was done. Wait {wait_s:.1f} s."
                 acknowledged = self._refuse(name, "too_many", text)
             else:
-                acknowledged = self._inbox.ask(self._pair, command, within_s)
+                acknowledged = self._inbox.request(self._pair, command, within_s)
         except BusyError as error:
             late = time.monotonic() >= deadline_s and str(error) != STARTED
             code, text = ("expired", EXPIRED) if late else (error.reply_code, str(error))

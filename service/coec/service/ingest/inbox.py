@@ -162,7 +162,7 @@ class Inbox:
             self._posted.append(Posted(receiver, event))
             self._condition.notify()
 
-    def ask(self, receiver: str, event: object, timeout_s: float) -> Any:
+    def request(self, receiver: str, event: object, timeout_s: float) -> Any:
         """Posts an event and waits for its reply; an exception of the reader is raised here.
 
         Raises:
