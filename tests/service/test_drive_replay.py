@@ -126,14 +126,14 @@ def test_differences_name_what_differs_where() -> None:
 
     before = (check(1, 0.0), check(2, 0.0), Decision("state", 2, "healthy", {"code": "healthy"}))
     after = (check(1, 0.0), check(2, 0.5), check(3, 0.0))
-    found = differences(before, after)
-    assert [(one.either.kind, one.either.stamp_ns, one.fields) for one in found] == [
+    differing = differences(before, after)
+    assert [(one.either.kind, one.either.stamp_ns, one.fields) for one in differing] == [
         ("check", 2, ("evidence",)),
         ("state", 2, ()),
         ("check", 3, ()),
     ]
-    assert [one.before is None for one in found] == [False, False, True]
-    assert [one.after is None for one in found] == [False, True, False]
+    assert [one.before is None for one in differing] == [False, False, True]
+    assert [one.after is None for one in differing] == [False, True, False]
 
 
 def test_people_read_the_outline_the_steps_and_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

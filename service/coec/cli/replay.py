@@ -225,29 +225,29 @@ def _show_drive(
 
     log, against, report = files
     first_ns = recording.camera_stamps_ns[0]
-    found: tuple[Difference, ...] = ()
+    differing: tuple[Difference, ...] = ()
     if against is not None:
         there = [one for one in read_log(against, pair) if replayed.begin_ns <= one.stamp_ns <= replayed.end_ns]
-        found = differences(there, replayed.decisions)
+        differing = differences(there, replayed.decisions)
     if log is not None:
         write_log(log, replayed.decisions)
     if report is not None:
         from coec.service.replay_page import write_replay_page
 
-        write_replay_page(report, recording.name, replayed, first_ns, None if against is None else found)
+        write_replay_page(report, recording.name, replayed, first_ns, None if against is None else differing)
     if as_json:
-        console.print_json(_document(replayed, None if against is None else found))
-        return 1 if found else 0
+        console.print_json(_document(replayed, None if against is None else differing))
+        return 1 if differing else 0
     if explain_s is None:
         _table(replayed, first_ns)
     else:
         _explain(replayed, first_ns, explain_s)
     if against is not None:
-        _show_differences(found, against, first_ns)
-    return 1 if found else 0
+        _show_differences(differing, against, first_ns)
+    return 1 if differing else 0
 
 
-def _document(replayed: ReplayedDrive, found: tuple[Difference, ...] | None) -> dict[str, Any]:
+def _document(replayed: ReplayedDrive, differing: tuple[Difference, ...] | None) -> dict[str, Any]:
     return {
         "driven_s": replayed.driven_s,
         "elapsed_s": replayed.elapsed_s,
@@ -261,7 +261,7 @@ def _document(replayed: ReplayedDrive, found: tuple[Difference, ...] | None) -> 
             for (place, cause), number in sorted(replayed.losses.items())
         ],
         "differences": None
-        if found is None
+        if differing is None
         else [
             {
                 "kind": one.either.kind,
@@ -270,7 +270,7 @@ def _document(replayed: ReplayedDrive, found: tuple[Difference, ...] | None) -> 
                 "after": None if one.after is None else one.after.name,
                 "fields": one.fields,
             }
-            for one in found
+            for one in differing
         ],
     }
 
@@ -296,16 +296,16 @@ def _table(replayed: ReplayedDrive, first_ns: int) -> None:
     )
 
 
-def _show_differences(found: tuple[Difference, ...], against: Path, first_ns: int) -> None:
+def _show_differences(differing: tuple[Difference, ...], against: Path, first_ns: int) -> None:
     from coec.reports import console
     from coec.reports.formatting import count
 
-    if not found:
+    if not differing:
         console.show(f"equal to {against}", "bold green")
         return
-    console.show(f"{count(len(found), 'difference')} from {against}", "bold red")
+    console.show(f"{count(len(differing), 'difference')} from {against}", "bold red")
     table = console.table("s", "decision", "there", "here", "fields")
-    for one in found:
+    for one in differing:
         before, after = one.before, one.after
         table.add_row(
             f"{(one.either.stamp_ns - first_ns) / NS_PER_S:.1f}",

@@ -94,7 +94,7 @@ def _action_texts(actions: Sequence[Any]) -> Iterator[str]:
 
 
 def write_replay_page(
-    path: Path, name: str, replayed: ReplayedDrive, first_ns: int, found: Sequence[Difference] | None
+    path: Path, name: str, replayed: ReplayedDrive, first_ns: int, differing: Sequence[Difference] | None
 ) -> None:
     """Writes a page with the decisions of a drive and, if they were compared, what differs.
 
@@ -105,8 +105,8 @@ def write_replay_page(
     sections = [
         Section("Decisions", (Table("In the order of sensor time.", HEADS, rows, frozenset({0}), frozenset({3})),))
     ]
-    if found is not None:
-        sections.insert(0, Section("Differences", (_differences(found, first_ns),)))
+    if differing is not None:
+        sections.insert(0, Section("Differences", (_differences(differing, first_ns),)))
     losses = tuple((f"{place}, {cause}", str(number)) for (place, cause), number in sorted(replayed.losses.items()))
     if losses:
         sections.append(Section("Losses", (Facts(losses),)))
@@ -124,8 +124,8 @@ def write_replay_page(
 HEADS = ("Time, s", "Decision", "Outcome", "Details")
 
 
-def _differences(found: Sequence[Difference], first_ns: int) -> Table | Text:
-    if not found:
+def _differences(differing: Sequence[Difference], first_ns: int) -> Table | Text:
+    if not differing:
         return Text(("The decisions are equal.",))
     rows = [
         (
@@ -135,7 +135,7 @@ def _differences(found: Sequence[Difference], first_ns: int) -> Table | Text:
             "none" if one.after is None else one.after.name,
             ", ".join(one.fields),
         )
-        for one in found
+        for one in differing
     ]
     heads = ("Time, s", "Decision", "There", "Here", "Values that differ")
     return Table("Decisions that differ.", heads, rows, frozenset({0}), frozenset({4}))

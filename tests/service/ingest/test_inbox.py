@@ -9,14 +9,14 @@ import pytest
 from coec.service.ingest.inbox import COMMANDS_WAITING, BusyError, Inbox, PendingReply
 
 
-def test_what_nobody_waits_for_any_more_is_not_begun() -> None:
+def test_what_nobody_waits_for_any_more_is_not_started() -> None:
     reply = PendingReply()
     with pytest.raises(BusyError, match="nothing was done"):
         reply.result(0.0)
     assert not reply.begin()
 
 
-def test_what_was_begun_in_time_is_waited_for() -> None:
+def test_what_was_started_in_time_is_waited_for() -> None:
     reply = PendingReply()
     assert reply.begin()
     finish = threading.Timer(0.0, reply.finish, ("done",))
@@ -25,7 +25,7 @@ def test_what_was_begun_in_time_is_waited_for() -> None:
     finish.join()
 
 
-def test_an_exception_is_raised_where_the_reply_is_awaited() -> None:
+def test_an_exception_is_raised_where_the_reply_is_received() -> None:
     reply = PendingReply()
     assert reply.begin()
     reply.fail(ZeroDivisionError())
