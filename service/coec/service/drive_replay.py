@@ -137,13 +137,13 @@ class _ReplayVehicle(Vehicle):
         """Called on the thread of a worker."""
         self._outcomes.put((receiver, subject, outcome))
 
-    def deliver(self, wanted: JobSubject) -> None:
-        """Posts the outcome about `wanted` if it has come; waits up to `POLL_S` for any."""
+    def deliver(self, requested: JobSubject) -> None:
+        """Posts the outcome about `requested` if it has come; waits up to `POLL_S` for any."""
         with suppress(queue.Empty):
-            if not any(subject == wanted for _, subject, _ in self._arrived):
+            if not any(subject == requested for _, subject, _ in self._arrived):
                 self._arrived.append(self._outcomes.get(timeout=POLL_S))
         for arrived in self._arrived:
-            if arrived[1] == wanted:
+            if arrived[1] == requested:
                 self._arrived.remove(arrived)
                 super().post_outcome(*arrived)
                 return
