@@ -16,6 +16,7 @@ from coec.calibration.state_machine import HealthState
 from coec.config import Config
 from coec.errors import NotFoundError
 from coec.io.disk_writer import DiskWriter
+from coec.io.system import ServiceThread
 from coec.io.zenoh.ros_node import RosTopicList
 from coec.schemas.keys import Keys
 from coec.schemas.message import to_json
@@ -217,6 +218,24 @@ def test_where_people_decide_the_correction_waits_for_them(tmp_path: Path) -> No
         state = bench.pairs[name].answers._store.state
         assert state.pending is not None
         assert not np.allclose(state.T_camera_lidar, AFTER, atol=1e-3)
+
+
+@pytest.mark.parametrize("number", [1, 24])
+def test_the_number_of_threads_does_not_depend_on_that_of_the_pairs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    threads: list[str] = []
+    create = ServiceThread.__init__
+
+    def created(self: ServiceThread, name: str, run: Callable[[ServiceThread], None]) -> None:
+        threads.append(name)
+        create(self, name, run)
+
+    monkeypatch.setattr(ServiceThread, "__init__", created)
+    (pair, *_) = _configuration(tmp_path, "never").pairs
+    pairs = tuple(pair.model_copy(update={"name": f"pair-{index}"}) for index in range(number))
+    RigBench(tmp_path / "state", config=_configuration(tmp_path, "never").model_copy(update={"pairs": pairs}))
+    assert sorted(threads) == ["disk-writer", "engine", "recorder"], "what the pairs share"
 
 
 def test_a_command_for_a_sensor_is_one_for_each_of_its_pairs(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
@@ -27,7 +27,8 @@ from coec.schemas.keys import ros_name
 from coec.schemas.replies import ExtrinsicReply, HealthReply
 from coec.schemas.rig_state import RigReply
 from coec.service.worker import worker_jobs
-from coec.service.worker.worker_jobs import JobOutcome, RenderedImage, WorkerJob
+from coec.service.worker.supervisor import Worker
+from coec.service.worker.worker_jobs import JobOutcome, RenderedImage
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,28 +113,10 @@ PICTURE_PERIOD_S = 1.0
 """Time between two pictures of a pair, s. A picture takes the worker some tenths of a second."""
 
 
-class JobSubmitter(Protocol):
-    """The worker."""
-
-    def submit(self, job: WorkerJob) -> None:
-        """See `runtime.worker.supervisor`."""
-
-
-class PictureTopic(Protocol):
-    """The publisher of a pair's pictures."""
-
-    @property
-    def has_subscribers(self) -> bool:
-        """Whether somebody subscribes."""
-
-    def put(self, payload: bytes, source_ns: int) -> None:
-        """Publishes a message in CDR."""
-
-
 class CheckPictures:
     """The pictures of all pairs. For any thread."""
 
-    def __init__(self, worker: JobSubmitter, topics: Mapping[str, PictureTopic]) -> None:
+    def __init__(self, worker: Worker, topics: Mapping[str, RosPublisher]) -> None:
         """`topics` holds the publishers by names of pairs; further ones may be added later."""
         self._worker = worker
         self._topics = topics
@@ -200,7 +183,7 @@ class RosOutputs:
     """Publishes everything that `ros.publish` names, which may be nothing. Its thread is the only one that publishes,
     except for pictures."""
 
-    def __init__(self, publishers: RosPublishers | None, config: Config, worker: JobSubmitter) -> None:
+    def __init__(self, publishers: RosPublishers | None, config: Config, worker: Worker) -> None:
         """`publishers` are those of the session; None if it does not speak to ROS. Declares nothing yet."""
         self._publishers = publishers
         self._ros = config.ros

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ import pytest
 from coec.calibration.types import Reason
 from coec.io.ros.messages import COMPRESSED_IMAGE
 from coec.io.ros.wire_format import Qos
+from coec.io.zenoh.ros_node import RosPublisher
 from coec.service.ros_output import PICTURE_PERIOD_S, CheckPictures
+from coec.service.worker.supervisor import Worker
 from coec.service.worker.worker_jobs import Fate, JobOutcome, Kind, RenderedImage, WorkerJob
 from support.recorded_topics import RetainedTopic
 from support.vehicles import frame_pair_at, pair_configuration
@@ -31,7 +34,7 @@ class Scene:
     now_s: float = 100.0
 
     def __post_init__(self) -> None:
-        self.pictures = CheckPictures(self, {"front": self.topic})
+        self.pictures = CheckPictures(cast("Worker", self), {"front": cast("RosPublisher", self.topic)})
 
     def submit(self, job: WorkerJob) -> None:
         self.jobs.append(job)
@@ -85,5 +88,5 @@ def test_one_at_a_time_and_none_too_soon(scene: Scene, end: JobOutcome) -> None:
 
 
 def test_a_pair_without_a_topic_is_not_rendered(scene: Scene) -> None:
-    CheckPictures(scene, {}).show(PAIR, frame_pair_at(STAMP_NS), np.eye(4))
+    CheckPictures(cast("Worker", scene), {}).show(PAIR, frame_pair_at(STAMP_NS), np.eye(4))
     assert scene.jobs == []

@@ -16,6 +16,7 @@ from coec.io.ros.message_encoding import ServicePhase
 from coec.io.ros.wire_format import STATIC, Qos
 from coec.io.zenoh.ros_node import RosPublishers
 from coec.service.ros_output import PairOutput, RosOutputs, VehicleOutput
+from coec.service.worker.supervisor import Worker
 from support.fake_worker import wait_until
 from support.recorded_topics import RetainedTopic, RetainedTopics
 from support.vehicles import BEGIN_S, DRIVE_END_S, STEP_S, OracleWorker, PairBench
@@ -34,7 +35,7 @@ class Reported:
         self.rig: Rig | None = bench.answers.rig
         self.topics = RetainedTopics()
         self.config: Config = bench.config.model_copy(update={"ros": ros, "middleware": "rmw_zenoh"})
-        self.outputs = RosOutputs(cast("RosPublishers", self.topics), self.config, OracleWorker())
+        self.outputs = RosOutputs(cast("RosPublishers", self.topics), self.config, cast("Worker", OracleWorker()))
 
     def view(self) -> VehicleOutput:
         answers = self.bench.answers
@@ -164,7 +165,7 @@ def test_who_wants_nothing_reported_has_no_thread_and_no_topic(tmp_path: Path) -
     assert reported.outputs.threads == ()
     assert reported.outputs.close(1.0)
     assert reported.topics.topics == {}
-    deaf = RosOutputs(None, reported.config.model_copy(update={"ros": ALL}), OracleWorker())
+    deaf = RosOutputs(None, reported.config.model_copy(update={"ros": ALL}), cast("Worker", OracleWorker()))
     deaf.start(reported.view)
     deaf.wake()
     assert deaf.threads == ()

@@ -174,7 +174,7 @@ class PairAnswers:
         context: VehicleContext,
         commands: Callable[[], dict[str, int]],
     ) -> None:
-        """Nothing can be asked before `hear` was called once. `commands()` returns the counts of commands."""
+        """Nothing can be answered before `on_update` was called once. `commands()` returns the counts of commands."""
         self.name = pair.name
         self._pair = pair
         self._vehicle = config.vehicle
@@ -201,7 +201,7 @@ class PairAnswers:
         """Answers by these settings from now on. For any thread."""
         self._pair, self._config_hash = pair, config_hash(pair.calibration)
 
-    # --- on the thread that decides; `fail` on the main thread --------------------------------------------------------
+    # --- on the thread of the engine; `fail` on the main thread -----------------------------------------------------
 
     def on_update(self, known: PairSnapshot) -> None:
         """Serialises the answers anew, and publishes what has changed."""
@@ -242,7 +242,7 @@ class PairAnswers:
                 self._context.publish(key, self._snapshots[name].answer("msgpack"))
 
     def fail(self, reason: Reason) -> None:
-        """Reports that the service is about to end, for this reason, from now on, whatever the thread that decides is
+        """Reports that the service is about to end, for this reason, from now on, whatever the thread of the engine is
         doing."""
         with self._lock:
             self._fault = reason

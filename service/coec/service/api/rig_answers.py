@@ -1,4 +1,4 @@
-"""Answers about the rig, from a snapshot that the rig's thread made. For any thread."""
+"""Answers about the rig, from a snapshot that the thread of the engine made. For any thread."""
 
 from collections.abc import Callable
 from math import degrees, isfinite, sqrt
@@ -25,7 +25,7 @@ from coec.service.engine.rig import ONE_PAIR, LidarPairStatus, RigSnapshot
 
 
 class RigAnswers:
-    """The answers about the rig of one vehicle. `hear` is for the rig's thread, everything else for any."""
+    """The answers about the rig of one vehicle. `on_update` is for the thread of the engine, the rest for any."""
 
     def __init__(self, keys: Keys, publish: Callable[[str, Answer], None]) -> None:
         self._keys = keys

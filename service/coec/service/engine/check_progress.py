@@ -49,7 +49,7 @@ that is reported as `overdue_worker`."""
 
 class Attempts:
     """Counts how many attempts of one kind have failed in a row, because a service that cannot look must not go on
-    reporting that all is well. Belongs to the thread that decides."""
+    reporting that all is well. Belongs to the thread of the engine."""
 
     def __init__(self, what: str, code: str) -> None:
         """`what`: name of the attempts, in the plural. `code`: code of the trouble."""
@@ -88,7 +88,7 @@ def _later(before: _Last, last: _Last) -> _Last:
 
 
 class CheckProgress:
-    """Progress of the checks of one pair. Belongs to the thread that decides."""
+    """Progress of the checks of one pair. Belongs to the thread of the engine."""
 
     def __init__(self, period_s: float, monotonic_s: float, report: StreamStatistics) -> None:
         self._period_s = period_s

@@ -167,7 +167,7 @@ class _OpenEvent:
 
 
 class FrameRing:
-    """Belongs to the thread of the intake. Holds at most `max_bytes` of frames: half is for those before an event, so
+    """Belongs to the thread of the engine. Holds at most `max_bytes` of frames: half is for those before an event, so
     that there is room for those that follow."""
 
     def __init__(self, config: SnippetsConfig, max_bytes: int, deliver: Callable[[Snippet], None]) -> None:

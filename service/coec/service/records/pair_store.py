@@ -2,7 +2,7 @@
 
 Every change of the state passes through `update`. It compares the states before and after, and writes down what has
 changed: a line of the history for every new extrinsic and every new state of health, and evidence for every red one.
-Then all books are put on the disk. Only the thread that decides about the pair changes them; what others read is
+Then all books are put on the disk. Only the thread of the engine changes them; what others read is
 immutable.
 """
 

@@ -86,8 +86,8 @@ class StoredRig(Part):
 
 
 class RigStore:
-    """The file of one rig. `recalled` and `remember` belong to the rig's thread, `flush` to the one that waits for the
-    disk.
+    """The file of one rig. `restored` and `update` belong to the thread of the engine, `flush` to the one that waits
+    for the disk.
 
     Attributes:
         damage: what was wrong with the file at the start; empty if nothing was.
@@ -240,7 +240,7 @@ def _pose(rows: Rows) -> Matrix4:
 
 
 class RigBaseline:
-    """Belongs to the thread that decides about the pair; `flush` is for the disk writer.
+    """Belongs to the thread of the engine; `flush` is for the disk writer.
 
     Attributes:
         trouble: why an existing baseline is not used; else None.
