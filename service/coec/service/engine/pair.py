@@ -126,6 +126,7 @@ class Pair:
         self._clock = clock
         self._statistics = StreamStatistics()
         self._clocks_checked_s = self._counted_s = clock.monotonic_s()
+        selector.tick(self._counted_s)
         self._progress = CheckProgress(pair.monitor.period_s, clock.monotonic_s(), self._statistics)
         self._latest_check: CheckReply | None = None
         self._checks = self._solved = 0
