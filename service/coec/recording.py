@@ -95,6 +95,7 @@ class Solution:
         fit: how well the fitted camera model fits; None where the recording's own model was used.
         offset: offset of the camera's clock; None where it was not requested.
         mistake: probable mistake in the inputs, if the result was refused; else None.
+        recognitions: what was recognised of the recording.
     """
 
     window: calibration.Window
@@ -104,6 +105,7 @@ class Solution:
     fit: CameraFit | None
     offset: TimeOffset | None
     mistake: calibration.Mistake | None = None
+    recognitions: tuple[calibration.Recognition, ...] = ()
 
 
 class MistakenInputError(CalibrationError):
@@ -146,7 +148,7 @@ def solve(loaded: LoadedWindow, options: CalibrationOptions, progress: calibrati
         offset = estimate_time_offset(window, images, estimate.optimum.T_camera_lidar, configuration)
         progress.step("time offset", 1, 1)
     result = result_of(estimate, window.rig, loaded.vehicle)
-    return Solution(window, estimate, result, configuration, fit, offset, mistake)
+    return Solution(window, estimate, result, configuration, fit, offset, mistake, loaded.recognitions)
 
 
 def calibrated(

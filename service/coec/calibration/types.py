@@ -94,6 +94,21 @@ class ImageQuality:
     digest: int
 
 
+@dataclass(frozen=True, slots=True)
+class Recognition:
+    """What the values of a recording show of how it was written, and its fields do not say.
+
+    Attributes:
+        code: machine-readable.
+        text: how it was read, and what to type if that is wrong.
+        is_doubt: whether a person should look at it.
+    """
+
+    code: str
+    text: str
+    is_doubt: bool = False
+
+
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class LidarFrame:
     """One sweep, in the LiDAR frame, not motion-compensated. Every array has the same length N, every point is finite.
@@ -105,6 +120,7 @@ class LidarFrame:
         time_offset_s: (N,) float32 or None: when each point was measured, relative to `stamp_ns`.
         timed_by: a line for people: how point times were read if the message leaves that open; empty otherwise.
         not_finite: number of points that were left out because their position or time is not finite.
+        recognitions: what its values showed.
     """
 
     stamp_ns: int
@@ -116,6 +132,7 @@ class LidarFrame:
     sequence: int | None = None
     timed_by: str = ""
     not_finite: int = 0
+    recognitions: tuple[Recognition, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, weakref_slot=True)

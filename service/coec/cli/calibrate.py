@@ -114,6 +114,7 @@ def _show(solution: Solution, document: dict[str, Any], *, intrinsics: bool) -> 
         camera_fit=document.get("camera_fit"),
         time_offset=document.get("time_offset"),
         mistake=document["mistake"],
+        recognitions=document["recognitions"],
         elapsed_s=document["elapsed_s"],
         intrinsics=intrinsics,
     )
@@ -123,11 +124,12 @@ def _document(solution: Solution, elapsed_s: dict[str, float]) -> dict[str, Any]
     import numpy as np
 
     from coec.io.serialise import mistake_of
-    from coec.schemas.replies import CalibrationReport
+    from coec.schemas.replies import CalibrationReport, Reason
 
     fit, offset = solution.fit, solution.offset
     mistake = None if solution.mistake is None else mistake_of(solution.mistake)
-    report = CalibrationReport(**dict(solution.result), elapsed_s=elapsed_s, mistake=mistake)
+    recognised = tuple(Reason(code=one.code, text=one.text) for one in solution.recognitions)
+    report = CalibrationReport(**dict(solution.result), elapsed_s=elapsed_s, mistake=mistake, recognitions=recognised)
     document: dict[str, Any] = report.model_dump(mode="json")
     if fit is not None:
         document["camera_fit"] = {
@@ -188,7 +190,9 @@ def _write(
         blocks = (*blocks, Pictures((file_picture(paths[-1]),)))
     report = CalibrationReport.model_validate(document)
     written = files.write_output(folder / "result.json", to_json(report))
-    remarks = calibration.remarks(document.get("camera_fit"), document.get("time_offset"), document["mistake"])
+    remarks = calibration.remarks(
+        document.get("camera_fit"), document.get("time_offset"), document["mistake"], document["recognitions"]
+    )
     of_result = calibration_page(
         report, window, calibration.start_of(window), blocks, remarks, Provenance.here(), intrinsics=intrinsics
     )

@@ -39,6 +39,7 @@ def show(
     camera_fit: Mapping[str, Any] | None,
     time_offset: Mapping[str, Any] | None,
     mistake: Mapping[str, Any] | None,
+    recognitions: Sequence[Mapping[str, Any]],
     elapsed_s: Mapping[str, float],
     intrinsics: bool = False,
 ) -> None:
@@ -49,6 +50,7 @@ def show(
         configuration: with which it was calibrated.
         camera_fit, time_offset: as `--json` has them; None: not asked for.
         mistake: in the inputs, as `--json` has it; None: none was found.
+        recognitions: of the recording, as `--json` has them.
         elapsed_s: seconds by stage.
         intrinsics: whether the lens is shown, too.
     """
@@ -70,7 +72,7 @@ def show(
         console.show(
             "the field `ring` holds one number and was ignored: beams were told apart by their elevation", "yellow"
         )
-    for note in remarks(camera_fit, time_offset):
+    for note in remarks(camera_fit, time_offset, None, recognitions):
         console.show(note)
     if result.independent_looks is not None:
         console.show(
@@ -84,9 +86,10 @@ def remarks(
     camera_fit: Mapping[str, Any] | None,
     time_offset: Mapping[str, Any] | None,
     mistake: Mapping[str, Any] | None = None,
+    recognitions: Sequence[Mapping[str, Any]] = (),
 ) -> list[str]:
     """What else was found out, one sentence each; all arguments as `--json` has them, None: not asked for, or none."""
-    sentences = [] if mistake is None else [str(mistake["text"])]
+    sentences = [str(one["text"]) for one in (*([] if mistake is None else [mistake]), *recognitions)]
     if camera_fit is not None:
         sentences.append(
             f"{camera_fit['model']} fitted to {camera_fit['of']}: {camera_fit['residual_rms_px']:.4f} px rms, "

@@ -29,7 +29,7 @@ from coec.config import PairingConfig, WindowConfig
 from coec.geometry.cameras import in_image
 from coec.geometry.points import lengths
 from coec.geometry.projection import project
-from coec.io.recordings.recording_source import RecordingSource
+from coec.io.recordings.recording_source import RecordingSource, recognitions_of
 from coec.io.recordings.window_cutting import clocks_text, evenly_spread
 
 NS_PER_S = 1e9
@@ -172,7 +172,10 @@ def fitness_of(recording: RecordingSource) -> Fitness:
         clocks="" if pairs else clocks_text(stamps_ns, recording.sweep_stamps_ns),
         remarks=(),
     )
-    return _with_remarks(seen)
+    recognised = [
+        Notice("warn" if one.is_doubt else "ok", one.code, one.text) for one in recognitions_of(recording, sweeps)
+    ]
+    return _with_remarks(seen, recognised)
 
 
 def pairs_of_calibration(seen: Fitness) -> int:
@@ -249,8 +252,8 @@ def passes(sweep: LidarFrame) -> int:
     return 1 + int((np.diff(times_s) < -0.5 * span_s).sum())
 
 
-def _with_remarks(seen: Fitness) -> Fitness:
-    remarks = [notice for notice in _remarks(seen) if notice is not None]
+def _with_remarks(seen: Fitness, recognised: Sequence[Notice]) -> Fitness:
+    remarks = [notice for notice in (*recognised, *_remarks(seen)) if notice is not None]
     return replace(seen, remarks=tuple(sorted(remarks, key=lambda notice: _ORDER[notice.level])))
 
 

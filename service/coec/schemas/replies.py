@@ -238,6 +238,9 @@ class CalibrationReport(CalibrationResult):
     mistake: ProbableMistake | None = Field(
         default=None, description="probable mistake in the inputs of a refused result"
     )
+    recognitions: tuple[Reason, ...] = Field(
+        default=(), description="how the recording was read where its values show more than its fields"
+    )
 
 
 # --- replies ------------------------------------------------------------------------------------------------

@@ -1,6 +1,6 @@
 """From where the points of a cloud were measured: the cones on which a turning LiDAR's points lie, an origin that
 contradicts the stated frame, and clouds of several LiDARs joined into one, recognised by their rings if no field
-names the source of a point.
+names the source of a point; and whether the numbers in the field that is read as ring are rings at all.
 
 A laser of a turning LiDAR has one elevation, seen from the sensor: its points lie on a cone about the sensor's axis.
 Cones are described by their tip (x, y, z; metres) and the slope of their axis (x, y; per metre of height): (5,).
@@ -22,7 +22,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.types import LidarFrame, Matrix4
+from coec.calibration.types import LidarFrame, Matrix4, Recognition
 
 Doubles = NDArray[np.float64]
 
@@ -34,6 +34,11 @@ STEPS, STEP = 16, 1e-3
 
 LONGEST = np.array([1.0, 1.0, 1.0, 0.2, 0.2])
 """Longest step of the search: metres, and slopes of the axis."""
+
+TOLD_APART = 0.5
+"""Rings are scan lines if the elevations within a ring deviate by at most this share of their deviation over all
+points. The beams of a turning LiDAR: less than 0.1; the lasers of a rosette, or zones of azimuth: about 1. See
+docs/measured.md."""
 
 NORMAL = 1.4826
 """Standard deviation of a normal distribution, in medians of its absolute deviations."""
@@ -54,11 +59,12 @@ class Rings:
     names: NDArray[np.int64]
 
     @classmethod
-    def of(cls, xyz_m: Doubles, ring: NDArray[np.integer]) -> Rings | None:
-        """The rings among points (N, 3) with the ring names of the sensor (N,); None if there are too few rings."""
+    def of(cls, xyz_m: Doubles, ring: NDArray[np.integer], least: int = MIN_RINGS) -> Rings | None:
+        """The rings among points (N, 3) with the ring names of the sensor (N,); None if there are fewer than `least`
+        rings."""
         names, number, count = np.unique(ring, return_inverse=True, return_counts=True)
         full = count >= MIN_POINTS
-        if full.sum() < MIN_RINGS:
+        if full.sum() < least:
             return None
         keep = full[number]
         renumbered = np.cumsum(full) - 1
@@ -80,6 +86,13 @@ class Rings:
     def spread_rad(self, cones: Doubles) -> float:
         """The typical deviation, as the standard deviation of a normal distribution with the same median."""
         return NORMAL * float(np.median(np.abs(self.deviations_rad(cones))))
+
+    def are_told_apart(self, cones: Doubles) -> bool:
+        """Whether each ring has an elevation of its own there. From far enough away all points have nearly the same, so
+        that thin rings alone prove nothing."""
+        seen_rad = elevation_rad(self.xyz_m, cones)
+        within_rad = np.abs(seen_rad - self._beams_rad(seen_rad)[self.number]).mean()
+        return bool(within_rad <= TOLD_APART * np.abs(seen_rad - np.median(seen_rad)).mean())
 
     def sharpest(self) -> Doubles:
         """The cones (5,) from which the points deviate least: Gauss-Newton on the deviations, without those beyond
@@ -195,7 +208,7 @@ def _beginning(rings: Rings, guesses: tuple[Doubles, ...]) -> tuple[Rings, Doubl
         cones = next((guess for guess in guesses if block.spread_rad(guess) <= THIN_RAD), None)
         if cones is None:
             cones = block.sharpest()
-        if block.spread_rad(cones) <= THIN_RAD:
+        if block.spread_rad(cones) <= THIN_RAD and block.are_told_apart(cones):
             return block, cones
     return None
 
@@ -241,6 +254,13 @@ STRAYS = 0.1
 else is in view."""
 
 
+NO_SCAN_LINES = Recognition(
+    "no_scan_lines",
+    "The numbers in the field `ring` (`channel`, `line`) are no scan lines of a turning LiDAR, because the points of a "
+    "number do not lie at one elevation. The clouds are read as unordered points.",
+)
+
+
 @dataclass(frozen=True, slots=True)
 class ApparentOrigin:
     """The place from which the points of a cloud look measured, if that is not the stated origin.
@@ -273,6 +293,13 @@ def from_origin(sweep: LidarFrame, T_cloud_lidar: Matrix4, frame_id: str) -> Lid
     R, t = T_cloud_lidar[:3, :3], T_cloud_lidar[:3, 3]
     xyz_m = ((sweep.xyz_m.astype(np.float64) - t) @ R).astype(np.float32)
     return replace(sweep, frame_id=frame_id, xyz_m=xyz_m)
+
+
+def unordered(sweep: LidarFrame) -> LidarFrame:
+    """The sweep without its ring numbers, because they are no scan lines."""
+    if sweep.ring is None:
+        return sweep
+    return replace(sweep, ring=None, recognitions=(*sweep.recognitions, NO_SCAN_LINES))
 
 
 def apparent_origin(sweep: LidarFrame) -> ApparentOrigin | SeveralOrigins | None:
@@ -316,11 +343,20 @@ class OriginCheck:
         spread_rad = rings.spread_rad(cones)
         return ApparentOrigin((x, y, z), spread_rad, stated_rad) if math.hypot(x, y, z) >= MIN_SEPARATION_M else None
 
+    def has_scan_lines(self, sweep: LidarFrame) -> bool:
+        """Whether the ring numbers of a sweep, which was inspected or follows one that was, are scan lines: each with
+        its own elevation, seen from the stated origin or from where the inspected sweep was measured. True where too
+        few points tell."""
+        rings = _rings(sweep, 2)
+        return rings is None or any(
+            rings.are_told_apart(cones) for cones in (np.zeros(5), self._cones) if cones is not None
+        )
+
     def _one_of(self, rings: Rings, stated_rad: float) -> Doubles | None:
         """The cones of a single LiDAR, if they explain the rings."""
 
         def explain(cones: Doubles) -> bool:
-            return rings.spread_rad(cones) <= EXPLAINED * stated_rad
+            return rings.spread_rad(cones) <= EXPLAINED * stated_rad and rings.are_told_apart(cones)
 
         if self._cones is None or not explain(self._cones):
             cones = rings.sharpest()
@@ -333,8 +369,8 @@ class OriginCheck:
         return self._several
 
 
-def _rings(sweep: LidarFrame) -> Rings | None:
-    """The rings of a sweep at middle ranges; None if there are too few rings or points."""
+def _rings(sweep: LidarFrame, least: int = MIN_RINGS) -> Rings | None:
+    """The rings of a sweep at middle ranges; None if there are fewer than `least`, or too few points."""
     if sweep.ring is None:
         return None
     stride = max(1, len(sweep.xyz_m) // POINTS)
@@ -342,5 +378,4 @@ def _rings(sweep: LidarFrame) -> Rings | None:
     range_m = np.sqrt((xyz_m**2).sum(axis=1))
     # The limits are generous because ranges are from the stated origin, which may be wrong.
     inside = (range_m > NEAR_M) & (range_m < FAR_M)
-    xyz_m, ring = xyz_m[inside], ring[inside]
-    return Rings.of(xyz_m, ring)
+    return Rings.of(xyz_m[inside], ring[inside], least)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.frames.lidar_origin import apparent_origin, from_origin
+from coec.calibration.frames.lidar_origin import OriginCheck, from_origin, unordered
 from coec.calibration.types import LidarFrame, Matrix4
 from coec.errors import SourceError
 from coec.geometry.points import lengths
@@ -344,7 +344,7 @@ of a metre has a thousand."""
 def measured_from(
     cloud: LidarFrame, T_cloud_lidar: Matrix4, frame_id: str, where: Path, advice: Mapping[str, str]
 ) -> LidarFrame:
-    """A sweep in the LiDAR's own frame, see `from_origin`.
+    """A sweep in the LiDAR's own frame, see `from_origin`; without ring numbers that are no scan lines.
 
     Raises:
         SourceError: the points are in millimetres, or were not measured from the origin of that frame. The message of
@@ -357,10 +357,11 @@ def measured_from(
             f"{where}: half of the points are farther than {median_m:.0f} m: coordinates are in metres, "
             "so divide millimetres by 1000"
         )
-    contradiction = apparent_origin(sweep)
+    check = OriginCheck()
+    contradiction = check.inspect(sweep)
     if contradiction is not None:
         raise SourceError(f"{where}: {contradiction.sentence} {advice[contradiction.cause]}")
-    return sweep
+    return sweep if check.has_scan_lines(sweep) else unordered(sweep)
 
 
 def _frame(stamp_ns: int, frame_id: str, path: Path, columns: Columns) -> LidarFrame:

@@ -2,13 +2,13 @@
 the grammar of a SOURCE argument, `[layout:]path[?key=value&…]`.
 """
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 from urllib.parse import parse_qsl
 
-from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
+from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Recognition, Rig
 from coec.config import CalibrationConfig
 from coec.errors import UsageError
 from coec.extensions import SOURCES, added_by_packages
@@ -83,6 +83,22 @@ class HasGroundTruth(Protocol):
     def truth(self, stamp_ns: int) -> Matrix4:
         """True T_camera_lidar (4, 4) at a time."""
         ...
+
+
+@runtime_checkable
+class HasRecognitions(Protocol):
+    """A recording whose layout was recognised, from its values, when it was opened."""
+
+    @property
+    def recognitions(self) -> tuple[Recognition, ...]:
+        """What was recognised of the recording as a whole; sweeps have their own."""
+        ...
+
+
+def recognitions_of(recording: RecordingSource, sweeps: Iterable[LidarFrame]) -> tuple[Recognition, ...]:
+    """What was recognised of a recording and of these sweeps of it, each once."""
+    whole = recording.recognitions if isinstance(recording, HasRecognitions) else ()
+    return tuple({one.code: one for one in (*whole, *(one for sweep in sweeps for one in sweep.recognitions))}.values())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

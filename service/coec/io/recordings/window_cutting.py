@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.frames.window import NS_PER_S, BetweenPairs
-from coec.calibration.types import MOUNT_RAD, FramePair, Matrix4, Window
+from coec.calibration.types import MOUNT_RAD, FramePair, Matrix4, Recognition, Window
 from coec.config import CalibrationConfig, Config, LimitsConfig, PairingConfig, WindowConfig
 from coec.errors import SourceError, UsageError
 from coec.geometry import se3
@@ -20,7 +20,7 @@ from coec.geometry.projection import half_field_of_view_rad
 from coec.io.images import CompressingReducer
 from coec.io.mcap.window_reader import is_window, read_result, read_window
 from coec.io.recordings.layouts import RecordingSource, open_source
-from coec.io.recordings.recording_source import parse_spec
+from coec.io.recordings.recording_source import parse_spec, recognitions_of
 
 WHOLE = (0.0, math.inf)
 """Begin and end of the whole recording, in seconds after the first camera frame."""
@@ -45,12 +45,14 @@ class LoadedWindow:
         configuration: configuration of a recorded window; None for other recordings.
         vehicle: vehicle of a recorded window that holds its result; else the default name.
         unpaired: number of frames that found no partner, by cause.
+        recognitions: what was recognised of the recording.
     """
 
     window: Window
     configuration: CalibrationConfig | None
     vehicle: str
     unpaired: dict[str, int]
+    recognitions: tuple[Recognition, ...] = ()
 
 
 def load_window(
@@ -108,7 +110,8 @@ def window_of_recording(
     window_id = f"{recording.rig.pair}-{pairs[0].stamp_ns}"
     window = Window(window_id, recording.rig, recording.T_camera_lidar_start, tuple(pairs), MOUNT_RAD)
     losses = {cause: count for cause, count in pairer.losses.items() if count}
-    return LoadedWindow(window, recording.configuration, _default_vehicle(), losses)
+    recognised = recognitions_of(recording, (pair.lidar for pair in pairs))
+    return LoadedWindow(window, recording.configuration, _default_vehicle(), losses, recognised)
 
 
 def clocks_text(camera_stamps_ns: Sequence[int], sweep_stamps_ns: Sequence[int]) -> str:

@@ -18,7 +18,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from coec.calibration.frames.lidar_origin import ApparentOrigin, OriginCheck, SeveralOrigins, from_origin
+from coec.calibration.frames.lidar_origin import (
+    NO_SCAN_LINES,
+    ApparentOrigin,
+    OriginCheck,
+    SeveralOrigins,
+    from_origin,
+    unordered,
+)
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import (
     IDENTITY,
@@ -390,6 +397,7 @@ class Decoder:
         self._origin = OriginCheck()
         self._checked_period: int | None = None
         self._contradicted = self._ring_reported = False
+        self._ordered = True
         self.timed_by = ""
 
     def counts(self) -> StreamCounts:
@@ -514,12 +522,12 @@ class Decoder:
         contradiction = self._contradiction(sweep)
         if contradiction is not None:
             raise DecodeError(contradiction.cause, f"{contradiction.sentence} See lidar.{contradiction.setting}.")
-        return sweep
+        return sweep if self._ordered else unordered(sweep)
 
     def _contradiction(self, sweep: LidarFrame) -> ApparentOrigin | SeveralOrigins | None:
-        """What in a sweep contradicts the configured origin; None: nothing. Looks at the first sweep of each period of
-        sensor time, and at every sweep while there is a contradiction: the frame in which a driver sends changes with
-        its configuration, not from sweep to sweep."""
+        """What in a sweep contradicts the configured origin; None: nothing. Also notes whether rings are scan lines.
+        Looks at the first sweep of each period of sensor time, and at every sweep while there is a contradiction: the
+        frame in which a driver sends changes with its configuration, not from sweep to sweep."""
         period = sweep.stamp_ns // ORIGIN_PERIOD_NS
         if period == self._checked_period and not self._contradicted:
             return None
@@ -532,6 +540,10 @@ class Decoder:
                 extra={"fields": {"sensor": self._stream.sensor}},
             )
         contradiction = self._origin.inspect(sweep)
+        self._ordered = self._origin.has_scan_lines(sweep)
+        if not self._ordered and not self._ring_reported:
+            self._ring_reported = True
+            _log.warning(NO_SCAN_LINES.text, extra={"fields": {"sensor": self._stream.sensor}})
         self._contradicted = contradiction is not None
         return contradiction
 
