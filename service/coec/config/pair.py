@@ -73,7 +73,7 @@ class SweepConfig(ConfigModel):
 
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
-TimeBase = Literal["stamp", "clock"]
+TimeBase = Literal["stamp", "clock", "begin", "end"]
 
 
 class PointTimeConfig(ConfigModel):
@@ -82,7 +82,9 @@ class PointTimeConfig(ConfigModel):
     field: str = Field(min_length=1, max_length=64, description="name of the field with the time")
     unit: TimeUnit = Field(description="unit of its values")
     base: TimeBase = Field(
-        default="stamp", description="stamp: times since the cloud's stamp; clock: times on the clock of the stamp"
+        default="stamp",
+        description="stamp: times since the cloud's stamp; clock: times on the clock of the stamp; begin, end: times "
+        "on another clock, the stamp being that of the first or the last point",
     )
 
 

@@ -1,6 +1,7 @@
 """The times of points: recognised from their values, said in a line, refused where they may mean two things."""
 
 import math
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -248,3 +249,83 @@ def test_without_a_stamp_a_clock_that_is_named_is_believed() -> None:
 
     assert frame.stamp_ns == 345 * 10**9
     assert offsets_s(frame) == pytest.approx([0.0, 0.1])
+
+
+COUNT = 400
+RISING_S = np.linspace(0.0, 0.0999, COUNT)
+
+
+def cloud_of_drivers(fields: dict[str, tuple[str, list[float]]], stamp_ns: int = STAMP_NS) -> bytes:
+    columns: Columns = [(axis, "<f4", [float(k + 1) for k in range(COUNT)]) for axis in "xyz"]
+    sec, nsec = divmod(stamp_ns, 10**9)
+    return packed_cloud([*columns, *((name, *of_field) for name, of_field in fields.items())], sec=sec, nsec=nsec)
+
+
+def codes(frame: LidarFrame) -> list[str]:
+    return [one.code for one in frame.recognitions]
+
+
+@pytest.mark.parametrize("name", ["point_time_offset", "pointTime", "t_us", "deltaT", "usec", "Stamp"])
+@pytest.mark.parametrize(("form", "unit"), [("<u4", "ns"), ("<u4", "us"), ("<f4", "s"), ("<f4", "ms"), ("<f8", "us")])
+def test_a_field_that_no_driver_is_known_for_is_a_time_by_its_values(name: str, form: str, unit: str) -> None:
+    frame = sweep(cloud_of_drivers({name: (form, (RISING_S * TICKS[unit]).tolist())}))
+
+    assert offsets_s(frame) == pytest.approx(RISING_S, abs=1e-6)
+    assert codes(frame) == ["time_by_values"]
+
+
+def test_a_time_on_the_stamps_clock_needs_no_name() -> None:
+    absolute = ((RISING_S + STAMP_NS * 1e-9) * 1e6).tolist()
+    frame = sweep(cloud_of_drivers({"field_7": ("<f8", absolute), "id": ("<u4", list(range(COUNT)))}))
+
+    assert offsets_s(frame) == pytest.approx(RISING_S, abs=2e-6)
+
+
+def test_rows_that_are_stored_one_after_the_other_rise_each() -> None:
+    rows = np.tile(np.linspace(0.0, 0.0999, COUNT // 4), 4)
+    frame = sweep(cloud_of_drivers({"point_time": ("<f4", rows.tolist())}))
+
+    assert offsets_s(frame) == pytest.approx(rows, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["point_id", "ambient"])
+def test_a_counter_is_named_and_not_read(name: str) -> None:
+    (doubt,) = sweep(cloud_of_drivers({name: ("<u4", [300.0 * k for k in range(COUNT)])})).recognitions
+
+    assert doubt.is_doubt
+    assert f"?time={name},us,stamp" in doubt.text
+
+
+def test_what_does_not_rise_is_no_time() -> None:
+    values = np.random.default_rng(0).uniform(0.0, 0.1, COUNT).tolist()
+    frame = sweep(cloud_of_drivers({"some_time": ("<f4", values), "range": ("<f4", values)}))
+
+    assert (frame.time_offset_s, codes(frame)) == (None, [])
+
+
+@pytest.mark.parametrize("form", ["<f4", "<f8"])
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_values_that_are_not_finite_are_no_time(form: str, bad: float) -> None:
+    values = [*RISING_S.tolist()[:-1], bad]
+    assert sweep(cloud_of_drivers({"point_time": (form, values)})).time_offset_s is None
+
+
+@pytest.mark.parametrize("value", [0.0, STAMP_NS * 1.0])
+def test_one_time_for_all_points_is_reported(value: float) -> None:
+    frame = sweep(cloud_of_drivers({"timestamp": ("<f8", [value] * COUNT)}))
+
+    assert codes(frame) == ["one_point_time"]
+
+
+@pytest.mark.parametrize(("base", "begin_s"), [("begin", 0.0), ("end", -0.0999)])
+def test_times_on_another_clock_are_refused_with_what_to_type(base: Literal["begin", "end"], begin_s: float) -> None:
+    values = ((RISING_S + 668.4) * 1e9).tolist()
+    payload = cloud_of_drivers({"timestamp": ("<f8", values)})
+
+    error = refused(payload)
+    assert error.reason == "cloud_time"
+    assert "in ns they last 99.9 ms" in str(error)
+    assert f"?time=timestamp,ns,{base}" in str(error)
+
+    frame = sweep(payload, PointTimeConfig(field="timestamp", unit="ns", base=base))
+    assert offsets_s(frame) == pytest.approx(RISING_S + begin_s, abs=1e-6)

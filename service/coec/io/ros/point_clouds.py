@@ -17,6 +17,7 @@ Most programs that join clouds write no such field. Autoware's `concatenate_data
 elevation, distance, time_stamp) holds them. A `laser_id` or `channel` is the number of a beam, not of a LiDAR.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -28,7 +29,7 @@ from rosbags.typesys.stores.ros2_humble import sensor_msgs__msg__PointCloud2 as 
 from rosbags.typesys.stores.ros2_humble import sensor_msgs__msg__PointField as PointField
 from rosbags.typesys.stores.ros2_humble import std_msgs__msg__Header as Header
 
-from coec.calibration.types import LidarFrame
+from coec.calibration.types import LidarFrame, Recognition
 from coec.config import LimitsConfig, PointTimeConfig, TimeBase, TimeUnit
 from coec.errors import DecodeError
 from coec.io.frame_validation import Refusal, finite_rows, lidar_frame
@@ -49,6 +50,19 @@ FIELDS: Final = (
 
 ON_A_CLOCK: Final = ("timestamp", "time_stamp")
 """Names that drivers use both for the time of day and for the time since the stamp."""
+
+OTHERWISE_READ: Final = ("x", "y", "z", "intensity", "ring", "channel", "line", "rgb", "rgba")
+"""Names of fields that are no times."""
+
+LIKE_A_TIME: Final = re.compile(r"(?i:time|stamp|(^|_)(t|ts|dt|n?sec|[mnu]s|[mu]sec)(_|$))|[a-z]T($|[A-Z_])")
+"""Names that mean a time, in other drivers: Blickfeld `point_time_offset`, and whatever people think of."""
+
+FEWEST_STEPS: Final = 100
+"""Fewer points show no order."""
+
+RESET, FALLING = 0.5, 0.02
+"""A time rises from point to point in the order in which points are stored. Where rows or returns are stored one after
+the other, it falls by more than the first share of the sweep; of the other steps, at most the second share fall."""
 
 SHORTEST_S: Final = 1e-3
 """Shortest sweep. A shorter one needs no motion compensation: a millisecond at 30 m/s is 3 cm."""
@@ -75,17 +89,25 @@ _TICKS: Final[dict[TimeUnit, int]] = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns"
 """Ticks of each unit in a second."""
 
 _UNIT_TEXT: Final[dict[TimeUnit, str]] = {"s": "s", "ms": "ms", "us": "µs", "ns": "ns"}
-_BASES: Final[dict[TimeBase, str]] = {"stamp": "since the stamp", "clock": "on the stamp's clock"}
+_BASES: Final[dict[TimeBase, str]] = {
+    "stamp": "since the stamp",
+    "clock": "on the stamp's clock",
+    "begin": "on another clock, begins at the stamp",
+    "end": "on another clock, ends at the stamp",
+}
 
 
 @dataclass(frozen=True, slots=True)
 class TimeReading:
-    """One way to read a column; with it the first and last point are `begin_s` and `end_s` after the stamp."""
+    """One way to read a column; with it the first and last point are `begin_s` and `end_s` after the stamp, which the
+    column counts as `whole` of its units and `rest_s` seconds."""
 
     unit: TimeUnit
     base: TimeBase
     begin_s: float
     end_s: float
+    whole: float = 0
+    rest_s: float = 0.0
 
     @property
     def lasts_s(self) -> float:
@@ -137,7 +159,7 @@ def offsets_s(
     else:
         reading = recognised(name, values.dtype, begin, end, stamp_ns)
     line = f"{name}: {values.dtype.name}, {reading.sentence}{reading.stamped}"
-    return _after_stamp_s(values, reading, stamp_ns), line
+    return _after_stamp_s(values, reading), line
 
 
 def stamp_in(column: NDArray[Any], keep: NDArray[np.bool_] | None, configured: PointTimeConfig | None) -> int | None:
@@ -176,8 +198,8 @@ def recognised(name: str, dtype: np.dtype[Any], begin: float, end: float, stamp_
     if not candidates:
         raise DecodeError(
             Refusal.CLOUD_TIME,
-            f"the times in the field {name} of the points are not near the stamp of their sweep in any unit: do both "
-            "come from one clock?",
+            f"the times in the field {name} of the points are not near the stamp of their sweep in any unit: "
+            f"{_other_clock(name, begin, end, units, stamp_ns)}",
         )
     first = candidates[0]
     if all(_agree(first, other) for other in candidates):
@@ -191,6 +213,20 @@ def recognised(name: str, dtype: np.dtype[Any], begin: float, end: float, stamp_
     )
 
 
+def _other_clock(name: str, begin: float, end: float, units: Sequence[TimeUnit], stamp_ns: int) -> str:
+    """What times may be that are not near the stamp, and what to type."""
+    for reading in (_read(begin, end, unit, "clock", stamp_ns) for unit in reversed(units)):
+        if SHORTEST_S <= reading.lasts_s <= 0.1 * LONGEST_S and abs(reading.begin_s) > NEAR_S:
+            begins, ends = (f"{name},{reading.unit},{base}" for base in ("begin", "end"))
+            return (
+                f"in {_UNIT_TEXT[reading.unit]} they last {1e3 * reading.lasts_s:.1f} ms, and begin "
+                f"{abs(reading.begin_s):.3f} s {'before' if reading.begin_s < 0 else 'after'} the stamp, so they are "
+                "of another clock: let the driver stamp with the clock of the points; or, if the stamp is that of the "
+                f"first point, say `?time={begins}`, if of the last one, `?time={ends}` (`lidar.time` live)"
+            )
+    return "do both come from one clock?"
+
+
 def _as_named(name: str, readings: Sequence[TimeReading]) -> list[TimeReading]:
     """The readings without those on a clock, if the name means the time since the stamp and such a reading is left."""
     since_stamp = [reading for reading in readings if reading.base == "stamp"]
@@ -202,16 +238,18 @@ def _agree(a: TimeReading, b: TimeReading) -> bool:
 
 
 def _read(begin: float, end: float, unit: TimeUnit, base: TimeBase, stamp_ns: int) -> TimeReading:
-    whole, rest_s = _stamp(unit, base, stamp_ns)
+    whole, rest_s = _stamp(begin, end, unit, base, stamp_ns)
     ticks = _TICKS[unit]
-    return TimeReading(unit, base, (begin - whole) / ticks - rest_s, (end - whole) / ticks - rest_s)
+    return TimeReading(unit, base, (begin - whole) / ticks - rest_s, (end - whole) / ticks - rest_s, whole, rest_s)
 
 
-def _stamp(unit: TimeUnit, base: TimeBase, stamp_ns: int) -> tuple[int, float]:
-    """What a column counts from: whole seconds, in its unit, and the fraction in seconds. They are separate so that no
-    digit of a time of day is lost."""
+def _stamp(begin: float, end: float, unit: TimeUnit, base: TimeBase, stamp_ns: int) -> tuple[float, float]:
+    """What a column from `begin` to `end` counts from: whole seconds, in its unit, and the fraction in seconds. They
+    are separate so that no digit of a time of day is lost."""
     if base == "stamp":
         return 0, 0.0
+    if base != "clock":
+        return begin if base == "begin" else end, 0.0
     seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
     return seconds * _TICKS[unit], nanoseconds * 1e-9
 
@@ -226,16 +264,15 @@ def _range(values: NDArray[Any]) -> tuple[float, float]:
     return _range(values[np.isfinite(values)])
 
 
-def _after_stamp_s(values: NDArray[Any], reading: TimeReading, stamp_ns: int) -> NDArray[np.float32]:
+def _after_stamp_s(values: NDArray[Any], reading: TimeReading) -> NDArray[np.float32]:
     if reading.base == "stamp" and reading.unit == "s":
         return values.astype(np.float32, copy=False)
-    whole, rest_s = _stamp(reading.unit, reading.base, stamp_ns)
-    if not whole and not rest_s:
+    if not reading.whole and not reading.rest_s:
         return (values * (1.0 / _TICKS[reading.unit])).astype(np.float32)
     offset_s = values.astype(np.float64)
-    offset_s -= whole
+    offset_s -= reading.whole
     offset_s *= 1.0 / _TICKS[reading.unit]
-    offset_s -= rest_s
+    offset_s -= reading.rest_s
     return offset_s.astype(np.float32)
 
 
@@ -365,7 +402,7 @@ def frame_of(
         if ring is not None and ring.itemsize > 2 and int(ring.max()) > 0xFFFF:
             raise DecodeError(Refusal.CLOUD_FIELDS, "a ring number exceeds 65535")
         times = _times(message, by_name, finite_rows(xyz_m), stamp_ns, point_time)
-        return lidar_frame(
+        frame = lidar_frame(
             times.stamp_ns,
             message.header.frame_id,
             xyz_m,
@@ -374,6 +411,7 @@ def frame_of(
             times.offset_s,
             timed_by=times.description,
         )
+        return replace(frame, recognitions=times.recognitions) if times.recognitions else frame
 
 
 WRITTEN_TIME: Final = PointTimeConfig(field="time", unit="s", base="stamp")
@@ -467,12 +505,14 @@ class _Times:
     Attributes:
         stamp_ns: that of the header; if it has none, that of the first point, if points have a time of day.
         offset_s: (N,) seconds after the stamp; None if no field holds a time.
-        told: see `LidarFrame.timed_by`.
+        description: see `LidarFrame.timed_by`.
+        recognitions: see `LidarFrame`.
     """
 
     stamp_ns: int
     offset_s: NDArray[np.float32] | None
     description: str
+    recognitions: tuple[Recognition, ...] = ()
 
 
 def _times(
@@ -486,13 +526,74 @@ def _times(
     names = FIELDS if configured is None else (configured.field,)
     name = next((name for name in names if name in by_name), None)
     column = None if name is None else _column(message, by_name[name], "fiu")
+    recognitions: tuple[Recognition, ...] = ()
+    if name is None and configured is None:
+        name, column, recognitions = _unknown_time(message, by_name, keep, stamp_ns)
     if name is None or column is None:
-        return _Times(stamp_ns, None, "")
+        return _Times(stamp_ns, None, "", recognitions)
     first_ns = None if stamp_ns else stamp_in(column, keep, configured)
     offset_s, description = offsets_s(name, column, keep, first_ns or stamp_ns, configured)
+    if configured is None and len(offset_s) > 1 and float(np.ptp(offset_s)) < SHORTEST_S:
+        recognitions = (*recognitions, ONE_TIME)
     if first_ns is None:
-        return _Times(stamp_ns, offset_s, description)
-    return _Times(first_ns, offset_s, f"{description}; without a stamp, that of the first point is taken")
+        return _Times(stamp_ns, offset_s, description, recognitions)
+    description = f"{description}; without a stamp, that of the first point is taken"
+    return _Times(first_ns, offset_s, description, recognitions)
+
+
+ONE_TIME: Final = Recognition(
+    "one_point_time",
+    "All points of a cloud have one time. That is right for a flash LiDAR; otherwise the driver does not time its "
+    "points, and clouds taken while driving stay distorted: let the driver time each point, or record slowly.",
+    is_doubt=True,
+)
+
+
+def _unknown_time(
+    message: PointCloud2, by_name: Mapping[str, PointField], keep: NDArray[np.bool_] | None, stamp_ns: int
+) -> tuple[str | None, NDArray[Any] | None, tuple[Recognition, ...]]:
+    """The field that is the time of the points although no driver that is known calls it so, its column, and what to
+    tell. A field that rises through the cloud and could be a time counts as one if its values lie on the clock of the
+    stamp, which chance does not bring about, or if its name means a time; a counter rises, too, so that any other is
+    only named."""
+    times: list[tuple[str, NDArray[Any], TimeReading]] = []
+    doubts: list[str] = []
+    for name, field in by_name.items():
+        column = None if name in OTHERWISE_READ or not name.isprintable() else _column(message, field, "fiu")
+        values = None if column is None else (column if keep is None else column[keep])
+        if column is None or values is None or not stamp_ns or not _rises(values):
+            continue
+        try:
+            reading = recognised(name, column.dtype, *_range(values), stamp_ns)
+        except DecodeError as error:
+            doubts += [str(error)] if LIKE_A_TIME.search(name) else []
+            continue
+        if reading.lasts_s < SHORTEST_S:
+            continue
+        if reading.base == "clock" or LIKE_A_TIME.search(name):
+            times.append((name, column, reading))
+        else:
+            way = f"`?time={name},{reading.unit},{reading.base}` (`lidar.time` live)"
+            doubts.append(f"`{name}` rises from point to point: if it is a time, and no counter, say {way}")
+    if not times:
+        text = f"No field of the points is known as their time, but {'; '.join(doubts)}."
+        return None, None, (Recognition("perhaps_a_time", text, is_doubt=True),) if doubts else ()
+    name, column, reading = min(times, key=lambda one: one[2].base != "clock")
+    text = (
+        f"The field `{name}` is read as the time of the points, because it rises from point to point "
+        f"({reading.sentence}). If it is none, name the right one with `?time=FIELD,UNIT,BASE` (`lidar.time` live)."
+    )
+    return name, column, (Recognition("time_by_values", text),)
+
+
+def _rises(values: NDArray[Any]) -> bool:
+    """Whether a column rises in the order in which points are stored, in one pass or a few."""
+    steps = np.diff(values.astype(np.float64))
+    if len(steps) < FEWEST_STEPS or not np.isfinite(steps).all():
+        return False
+    span = float(np.ptp(values.astype(np.float64)))
+    small = steps[np.abs(steps) <= RESET * span]
+    return bool(span > 0.0 and len(small) >= 0.5 * len(steps) and (small < 0.0).sum() <= FALLING * (small != 0.0).sum())
 
 
 def _column(message: PointCloud2, field: PointField | None, kinds: str) -> NDArray[Any] | None:
