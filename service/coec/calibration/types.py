@@ -14,7 +14,7 @@ from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from math import pi, radians
-from typing import Protocol, TypeVar
+from typing import Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,12 +101,13 @@ class Recognition:
     Attributes:
         code: machine-readable.
         text: how it was read, and what to type if that is wrong.
-        is_doubt: whether a person should look at it.
+        level: `ok`: it is certain; `warn`: a person should look at it; `fail`: nothing can come of the recording as it
+            is.
     """
 
     code: str
     text: str
-    is_doubt: bool = False
+    level: Literal["ok", "warn", "fail"] = "ok"
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)

@@ -30,7 +30,7 @@ from coec.geometry.cameras import in_image
 from coec.geometry.points import lengths
 from coec.geometry.projection import project
 from coec.io.recordings.recording_source import RecordingSource, recognitions_of
-from coec.io.recordings.window_cutting import clocks_text, evenly_spread
+from coec.io.recordings.window_cutting import clocks_apart, clocks_text, evenly_spread
 
 NS_PER_S = 1e9
 
@@ -93,7 +93,8 @@ class Fitness:
         sync_ms: (median, most) of camera stamp minus sweep stamp, milliseconds.
         in_view: share of a sweep's points that the nominal extrinsic puts into the image, median.
         not_finite: share of a sweep's points that have no finite position or time, and are left out, median.
-        clocks: how far the stamps of the streams are apart, in a line; empty where frames find a sweep.
+        clocks: how far the stamps of the streams are apart, in a line; empty where frames find a sweep, unless the two
+            streams begin and end at different times.
         remarks: the most important first.
     """
 
@@ -169,12 +170,10 @@ def fitness_of(recording: RecordingSource) -> Fitness:
         sync_ms=(float(np.median(sync_ms)), float(np.abs(sync_ms).max())) if len(sync_ms) else None,
         in_view=float(np.median([in_view(sweep, rig) for sweep in sweeps])) if sweeps else 0.0,
         not_finite=float(np.median([_not_finite(sweep) for sweep in sweeps])) if sweeps else 0.0,
-        clocks="" if pairs else clocks_text(stamps_ns, recording.sweep_stamps_ns),
+        clocks=(clocks_apart if pairs else clocks_text)(stamps_ns, recording.sweep_stamps_ns),
         remarks=(),
     )
-    recognised = [
-        Notice("warn" if one.is_doubt else "ok", one.code, one.text) for one in recognitions_of(recording, sweeps)
-    ]
+    recognised = [Notice(one.level, one.code, one.text) for one in recognitions_of(recording, sweeps)]
     return _with_remarks(seen, recognised)
 
 
@@ -284,6 +283,8 @@ def _unpaired(seen: Fitness) -> Notice | None:
     tolerance_ms = 1e3 * PairingConfig().tolerance_s
     if seen.paired == 0.0:
         return Notice("fail", "no_pairs", f"No camera frame has a sweep within {tolerance_ms:.0f} ms: {seen.clocks}.")
+    if seen.clocks:
+        return Notice("fail", "clocks_apart", f"Frames find the wrong sweeps: {seen.clocks}.")
     if seen.paired < 0.9:
         return Notice("warn", "few_pairs", f"{1 - seen.paired:.0%} of the camera frames have no sweep near them.")
     return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coec.io.recordings.window_cutting import clocks_text
+from coec.io.recordings.window_cutting import clocks_apart, clocks_text
 
 BEGIN_NS, FRAMES_NS = 1_700_000_000_000_000_000, [k * 100_000_000 for k in range(20)]
 
@@ -38,4 +38,39 @@ def test_units_and_the_start_of_a_computer_are_named() -> None:
 def test_an_offset_that_is_nothing_known_gets_no_cause() -> None:
     rng = np.random.default_rng(0)
     for offset_s in rng.uniform(40.0, 3500.0, 20):
-        assert "images. The stamps" in text(BEGIN_NS + round(offset_s * 1e9))
+        assert "images: the images begin at" in text(BEGIN_NS + round(offset_s * 1e9))
+
+
+def test_both_begins_are_given_and_what_to_type() -> None:
+    tai = text(BEGIN_NS + 37 * 10**9)
+    assert "the images begin at 2023-11-14 22:13:20.000, the clouds at 2023-11-14 22:13:57.000" in tai
+    assert "?lidar_offset=-37," in tai
+    started = text(668_403_185_160)
+    assert "the clouds at 668.403 s" in started
+    assert "?lidar_offset=SECONDS," in started
+
+
+def test_images_that_are_stamped_when_received_are_suspected() -> None:
+    assert "stamped when it was received" in text(BEGIN_NS - 80_000_000, scale=10**6)
+
+
+def streams(offset_s: float, seconds: int = 90, late_s: float = 0.0) -> tuple[list[int], list[int]]:
+    cameras = [BEGIN_NS + k * 1_000_000_000 for k in range(seconds)]
+    return cameras, [stamp + round(offset_s * 1e9) + 10_000_000 for stamp in cameras[round(late_s) :]]
+
+
+@pytest.mark.parametrize("late_s", [0.0, 3.0])
+@pytest.mark.parametrize("offset_s", [37.0, -18.0, 3600.0])
+def test_streams_that_overlap_are_apart_if_they_begin_and_end_so(offset_s: float, late_s: float) -> None:
+    cameras, sweeps = streams(offset_s, late_s=late_s)
+    assert f"the clouds are {abs(offset_s):.3f} s" in clocks_apart(cameras, sweeps)
+
+
+@pytest.mark.parametrize("offset_s", [0.0, 0.08, -1.4, 3.0, 25.0, 60.0])
+def test_other_streams_are_not(offset_s: float) -> None:
+    cameras, sweeps = streams(offset_s)
+    assert clocks_apart(cameras, sweeps) == ""
+    # A LiDAR that is switched on later or off earlier is of the same clock.
+    assert clocks_apart(cameras, cameras[37:]) == ""
+    assert clocks_apart(cameras, cameras[:-37]) == ""
+    assert clocks_apart(cameras[:2], sweeps[:2]) == ""

@@ -5,6 +5,7 @@ recording that holds more than the window.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +112,9 @@ def window_of_recording(
     window = Window(window_id, recording.rig, recording.T_camera_lidar_start, tuple(pairs), MOUNT_RAD)
     losses = {cause: count for cause, count in pairer.losses.items() if count}
     recognised = recognitions_of(recording, (pair.lidar for pair in pairs))
+    apart = clocks_apart(recording.camera_stamps_ns, recording.sweep_stamps_ns)
+    if apart:
+        recognised = (Recognition("clocks_apart", f"Frames find the wrong sweeps: {apart}.", "fail"), *recognised)
     return LoadedWindow(window, recording.configuration, _default_vehicle(), losses, recognised)
 
 
@@ -123,19 +127,63 @@ def clocks_text(camera_stamps_ns: Sequence[int], sweep_stamps_ns: Sequence[int])
     overlap = sweeps[0] <= cameras[-1] and cameras[0] <= sweeps[-1]
     if not overlap:
         offset_s = float(sweeps[0] - cameras[0])
+    return _offset_text(offset_s, float(cameras[0]), float(sweeps[0]))
+
+
+def clocks_apart(camera_stamps_ns: Sequence[int], sweep_stamps_ns: Sequence[int]) -> str:
+    """As `clocks_text`, if the clouds begin and end one known difference of clocks before or after the images, so that
+    frames that find a sweep find a wrong one; empty otherwise."""
+    if min(len(camera_stamps_ns), len(sweep_stamps_ns)) < FEWEST_STAMPS:
+        return ""
+    cameras, sweeps = (np.array(stamps, dtype=np.float64) * 1e-9 for stamps in (camera_stamps_ns, sweep_stamps_ns))
+    begin_s, end_s = float(sweeps[0] - cameras[0]), float(sweeps[-1] - cameras[-1])
+    # A recorder ends all streams at once; sensors may take a while to start.
+    within_s = 0.5 + max(float(np.median(np.diff(stamps_s))) for stamps_s in (cameras, sweeps))
+    known_s = (*TIME_SCALES_S, *(3600.0 * hours for hours in range(1, 15)))
+    apart_s = min((sign * gap_s for gap_s in known_s for sign in (-1.0, 1.0)), key=lambda gap_s: abs(end_s - gap_s))
+    if abs(end_s - apart_s) > within_s or abs(begin_s - apart_s) > within_s + STARTING_S:
+        return ""
+    return _offset_text(apart_s, float(cameras[0]), float(sweeps[0]))
+
+
+def _offset_text(offset_s: float, camera_s: float, sweep_s: float) -> str:
+    cause = offset_cause(offset_s, camera_s, sweep_s)
+    # Only a difference of time scales is known exactly; streams begin up to a frame apart.
+    exact = any(abs(abs(offset_s) - gap_s) < 0.5 for gap_s in TIME_SCALES_S)
+    added = f"{-round(offset_s):d}" if exact else "SECONDS"
     return (
-        f"the clouds are {abs(offset_s):.3f} s {'ahead of' if offset_s > 0 else 'behind'} the images"
-        f"{offset_cause(offset_s, cameras[0], sweeps[0])}. The stamps must "
-        "be of one clock: let both drivers take the computer's time, or synchronise the sensors (PTP), and record "
-        "again; where the difference is known, correct the stamps of one stream"
+        f"the clouds are {abs(offset_s):.3f} s {'ahead of' if offset_s > 0 else 'behind'} the images{cause}: "
+        f"the images begin at {_begin(camera_s)}, the clouds at {_begin(sweep_s)}. The stamps must be of one clock: let "
+        "both drivers take the computer's time, or synchronise the sensors (PTP), and record again; where the difference "
+        f"is known, correct the stamps of one stream, of a bag with ?lidar_offset={added}, which is added to those of "
+        "the clouds"
     )
+
+
+def _begin(stamp_s: float) -> str:
+    """A stamp as a date; as seconds if it is none."""
+    if not EPOCH_S < stamp_s < YEAR_2100_S:
+        return f"{stamp_s:.3f} s"
+    return datetime.fromtimestamp(stamp_s, UTC).isoformat(" ", "milliseconds").removesuffix("+00:00")
 
 
 TIME_SCALES_S = {37.0: "TAI - UTC (PTP without its UTC offset)", 18.0: "GPS time - UTC", 19.0: "TAI - GPS time"}
 """Differences of time scales, s, since 2017."""
 
+LATE_S = 0.5
+"""Messages arrive within this time."""
+
 START_S = 1.0
 """Streams of one recording begin within this time."""
+
+STARTING_S = 5.0
+"""A sensor may take so much longer than another to start."""
+
+FEWEST_STAMPS = 3
+"""Fewer frames of a stream show no begin and no end."""
+
+YEAR_2100_S = 4.1e9
+"""Later stamps are none."""
 
 EPOCH_S = 1e8
 """Stamps below count from the start of a computer, not from 1970."""
@@ -153,6 +201,8 @@ def offset_cause(offset_s: float, camera_s: float, sweep_s: float) -> str:
     hours = round(offset_s / 3600.0)
     if hours and abs(offset_s - 3600.0 * hours) < START_S:
         return f" (whole hours, {hours:+d}: one driver probably stamps in local time)"
+    if abs(offset_s) < LATE_S:
+        return " (one of the two is probably stamped when it was received, not when it was measured)"
     scale = next((name for gap_s, name in TIME_SCALES_S.items() if abs(abs(offset_s) - gap_s) < 0.5), None)
     return "" if scale is None else f" (this is {scale})"
 

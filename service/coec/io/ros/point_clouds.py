@@ -545,7 +545,7 @@ ONE_TIME: Final = Recognition(
     "one_point_time",
     "All points of a cloud have one time. That is right for a flash LiDAR; otherwise the driver does not time its "
     "points, and clouds taken while driving stay distorted: let the driver time each point, or record slowly.",
-    is_doubt=True,
+    level="warn",
 )
 
 
@@ -577,7 +577,7 @@ def _unknown_time(
             doubts.append(f"`{name}` rises from point to point: if it is a time, and no counter, say {way}")
     if not times:
         text = f"No field of the points is known as their time, but {'; '.join(doubts)}."
-        return None, None, (Recognition("perhaps_a_time", text, is_doubt=True),) if doubts else ()
+        return None, None, (Recognition("perhaps_a_time", text, level="warn"),) if doubts else ()
     name, column, reading = min(times, key=lambda one: one[2].base != "clock")
     text = (
         f"The field `{name}` is read as the time of the points, because it rises from point to point "
