@@ -7,7 +7,7 @@ calls `solve` too.
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from math import inf
+from math import inf, isnan, nan
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Literal, Unpack
@@ -19,11 +19,12 @@ from coec.calibration import pipeline
 from coec.calibration import types as calibration
 from coec.calibration.frames.time_offset import TimeOffset, estimate_time_offset
 from coec.calibration.search.mistake_ranking import probable_mistake
+from coec.calibration.search.mistakes import CLOCK_OFFSET
 from coec.calibration.solver import prepare_window_data
 from coec.calibration.uncertainty.systematic import require_fit
 from coec.calibration_options import CalibrationOptions, Progress, checked, configuration_of
 from coec.config import CalibrationConfig, LimitsConfig, VerdictConfig, WindowConfig
-from coec.errors import CalibrationError, NotAcceptedError, SourceError, UsageError
+from coec.errors import CalibrationError, DecodeError, NotAcceptedError, SourceError, UsageError
 from coec.geometry.cameras import intrinsics_of, name_of
 from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
 from coec.io import user_files
@@ -175,8 +176,46 @@ def calibrated(
         return estimate, None
     data = prepare_window_data(window, depth, images, configuration, progress)
     mistake = probable_mistake(data, estimate.optimum.T_camera_lidar)
+    if mistake is None or mistake.code == CLOCK_OFFSET:
+        mistake = _measured_offset(window, images, estimate, configuration, mistake) or mistake
     progress.step("mistakes", 1, 1)
     return estimate, mistake
+
+
+CERTAIN = 5.0
+"""An offset of the clocks is named from so many standard deviations on, and from `LEAST_OFFSET_S`."""
+
+LEAST_OFFSET_S = 0.01
+"""A smaller offset refuses no window."""
+
+
+def _measured_offset(
+    window: calibration.Window,
+    images: calibration.ImageReader,
+    estimate: calibration.Estimate,
+    configuration: CalibrationConfig,
+    mistake: calibration.Mistake | None,
+) -> calibration.Mistake | None:
+    """The offset of the camera's clock, with its size, if it is certain, in the place of a `mistake` about clocks. That
+    straight driving cannot tell it from a shifted mount is in its standard deviation."""
+    try:
+        offset = estimate_time_offset(window, images, estimate.optimum.T_camera_lidar, configuration)
+    except (CalibrationError, DecodeError):
+        return None
+    certain = abs(offset.offset_s) >= max(CERTAIN * offset.sigma_s, LEAST_OFFSET_S)
+    if not certain or isnan(offset.sigma_s):
+        return None
+    late = "later" if offset.offset_s < 0.0 else "earlier"
+    text = (
+        f"the stamps of the camera are {1e3 * abs(offset.offset_s):.0f} ± {1e3 * offset.sigma_s:.0f} ms {late} than "
+        "its exposures by the clock of the LiDAR, as of images that are stamped when they are received, or sweeps that "
+        "are stamped at another point: correct the stamps in the driver and record again; of a bag, "
+        f"?camera_offset={offset.offset_s:.4f} is added to the stamps of the camera"
+    )
+    if mistake is not None:
+        return replace(mistake, text=text)
+    rig = window.rig
+    return calibration.Mistake(CLOCK_OFFSET, text, nan, nan, rig.camera, rig.T_camera_lidar_nominal, correctable=False)
 
 
 def perturbation_of(perturb: str | Sequence[float]) -> NDArray[np.float64]:

@@ -16,7 +16,8 @@ from coec.errors import OutputError, UsageError
 from coec.io import user_files
 from coec.io.depth.depth_maps import open_depth
 from coec.io.images import encode_png
-from coec.io.recordings.window_cutting import evenly_spread, parse_perturbation
+from coec.io.recordings.recording_source import evenly_spread
+from coec.io.recordings.window_cutting import parse_perturbation
 from golden.scene import Drive, write
 
 TOLERANCE_DEG = 0.35

@@ -63,7 +63,7 @@ def check(
         enough = f"{count(seen.camera.frames, 'camera frame')} suffice here; a check by the service needs {MIN_PAIRS}."
         remarks = (replace(n, level="warn", text=enough) if n.code == TOO_FEW else n for n in seen.remarks)
         seen = replace(seen, remarks=tuple(remarks))
-    notes = _ordered((*_of_mistake(mistake), *seen.remarks, *_of_trial(trial, seen)))
+    notes = _ordered((*_of_mistake(mistake), *seen.remarks, *_of_trial(trial, seen, mistake)))
     if as_json:
         console.print_json(_document(source, replace(seen, remarks=notes), trial, mistake))
     else:
@@ -102,16 +102,20 @@ def _of_mistake(mistake: Mistake | None) -> tuple[Notice, ...]:
     return () if mistake is None else (Notice("fail", mistake.code, mistake.text),)
 
 
-def _of_trial(trial: Estimate | CalibrationError | None, seen: Fitness) -> tuple[Notice, ...]:
-    """What the trial says of a calibration: for what it will be refused, and what a longer window may remedy."""
+def _of_trial(trial: Estimate | CalibrationError | None, seen: Fitness, mistake: Mistake | None) -> tuple[Notice, ...]:
+    """What the trial says of a calibration: for what it will be refused, and what a longer window may remedy. Clocks
+    that are apart look like a camera that moves."""
+    from coec.calibration.search.mistakes import CLOCK_OFFSET
+    from coec.calibration.types import MOVED
     from coec.reports.recording_fitness import Notice, pairs_of_calibration, reasons_that_stay
 
     if isinstance(trial, CalibrationError):
         return (Notice("fail", "no_calibration", f"{REFUSES}{trial}"),)
     if trial is None:
         return ()
-    staying = reasons_that_stay(trial, pairs_of_calibration(seen))
-    others = (reason for reason in trial.verdict.reasons if reason not in staying)
+    explained = (MOVED,) if mistake is not None and mistake.code == CLOCK_OFFSET else ()
+    staying = tuple(one for one in reasons_that_stay(trial, pairs_of_calibration(seen)) if one.code not in explained)
+    others = (one for one in trial.verdict.reasons if one not in staying and one.code not in explained)
     return (
         *(
             Notice("fail", reason.code, f"{'and because ' if rank else REFUSES}{reason.text}")

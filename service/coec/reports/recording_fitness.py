@@ -29,8 +29,8 @@ from coec.config import PairingConfig, WindowConfig
 from coec.geometry.cameras import in_image
 from coec.geometry.points import lengths
 from coec.geometry.projection import project
-from coec.io.recordings.recording_source import RecordingSource, recognitions_of
-from coec.io.recordings.window_cutting import clocks_apart, clocks_text, evenly_spread
+from coec.io.recordings.recording_source import RecordingSource, evenly_spread, recognitions_of
+from coec.io.recordings.window_cutting import clocks_apart, clocks_text
 
 NS_PER_S = 1e9
 

@@ -24,6 +24,7 @@ from coec.geometry import se3
 from coec.geometry.points import random_direction
 from coec.io.depth.depth_maps import open_depth
 from coec.io.recordings import window_cutting
+from coec.io.recordings.recording_source import evenly_spread
 from coec.reports.formatting import NONE, number, percent
 from coec.reports.page import Block, Page, Section, Table, Text, VerdictBanner
 from coec.reports.page_parts import Provenance
@@ -127,7 +128,7 @@ def run_times(source: str, configuration: CalibrationConfig, stages: Stages) -> 
     on_progress = stages.begin("run time", len(FRAME_COUNTS))
     times = []
     for count in sorted({min(count, len(window.pairs)) for count in FRAME_COUNTS}):
-        times.append(_run_time(bench, window_cutting.evenly_spread(len(window.pairs), count)))
+        times.append(_run_time(bench, evenly_spread(len(window.pairs), count)))
         on_progress(len(times), f"{count} frames")
     return times
 

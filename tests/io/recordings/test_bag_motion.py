@@ -20,7 +20,9 @@ TWIST = np.array([0.0, 0.0, 0.3, 5.0, 0.0, 0.0])
 """Turning at 5 m/s, the vehicle's own."""
 
 Message = tuple[str, Any]
-WITHOUT = [message for message in drive_messages() if message[0] != "/odom"]
+VEHICLE = [transform_message("base", name, np.eye(4)) for name in ("base_link", "ego")]
+DRIVE = [*drive_messages(), ("/tf_static", ros.tf2_msgs__msg__TFMessage(VEHICLE))]
+WITHOUT = [message for message in DRIVE if message[0] != "/odom"]
 
 
 def poses(parent: str = "odom", child: str = "base_link", topic: str = "/tf") -> list[Message]:
@@ -52,7 +54,7 @@ def motions(recording: RecordingSource, cameras: list[int] | None = None) -> lis
 
 
 def test_a_velocity_comes_before_transforms_and_these_before_turn_rates(tmp_path: Path) -> None:
-    everything = [*drive_messages(), *poses(), *imus()]
+    everything = [*DRIVE, *poses(), *imus()]
     assert {m.frame_id for m in motions(opened(tmp_path, everything))} == {"base"}
     assert {m.frame_id for m in motions(opened(tmp_path, [*WITHOUT, *twists(), *poses(), *imus()]))} == {"base"}
     assert {m.frame_id for m in motions(opened(tmp_path, [*WITHOUT, *imus(), *poses()]))} == {"base_link"}
@@ -73,7 +75,7 @@ def test_the_motion_in_transforms(tmp_path: Path) -> None:
 
 
 def test_any_topic_of_motion_is_taken_that_is_requested(tmp_path: Path) -> None:
-    everything = [*drive_messages(), *poses(), *imus(), *imus("/imu2")]
+    everything = [*DRIVE, *poses(), *imus(), *imus("/imu2")]
     turning = motions(opened(tmp_path, everything, "?odometry=/imu2"))
     assert [m.angular_radps[2] for m in turning] == pytest.approx([0.01 * k for k in range(40)])
     assert len(motions(opened(tmp_path, everything, "?odometry=/tf"))) == 19

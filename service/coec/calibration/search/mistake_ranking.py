@@ -170,7 +170,8 @@ def probable_mistake(data: WindowData, solved: Matrix4 | None) -> Mistake | None
     best, *others = ranked or [given]
     if timed is not None and timed.log_posterior > best.log_posterior:
         mistake = _named(timed, given)
-        return replace(mistake, text=f"{mistake.text} (the clouds {late_s:+.3f} s)") if late_s else mistake
+        by = f"(the clouds {late_s:+.3f} s; of a bag, ?lidar_offset={late_s:.3f})"
+        return replace(mistake, text=f"{mistake.text} {by}") if late_s else mistake
     if best is given:
         return None
     rivals = [given.log_posterior, *(one.log_posterior for one in others if not _same_place(one, best))]

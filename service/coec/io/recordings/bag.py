@@ -3,19 +3,24 @@
 A bag is read through once for its index (`index`); each message is read again when it is its turn.
 """
 
+from __future__ import annotations
+
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from coec.calibration.frames.lidar_origin import ApparentOrigin, SeveralOrigins
-from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Rig
+from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Recognition, Rig
 from coec.config import CalibrationConfig
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.io.mcap.window_reader import is_window, read_window
-from coec.io.recordings import bag_index, recording_source
+from coec.io.recordings import bag_index, bag_recognition, recording_source
+from coec.io.recordings.bag_recognition import Sweep
 from coec.io.recordings.bag_storage import BagReader, BagStorage, open_storage
 from coec.io.recordings.cloud_files import measured_from
+from coec.io.recordings.recording_source import evenly_spread
+from coec.io.ros import messages
 from coec.io.ros.topics import TopicInfo, TopicMessage
 
 _EGO, _LIDAR, _CAMERA = 0, 1, 2
@@ -29,9 +34,23 @@ _ADVICE = {
 }
 
 
+KEYS = (
+    "camera",
+    "points",
+    "odometry",
+    "intrinsics",
+    "lidar_frame",
+    "moving",
+    "time",
+    "lidar_source",
+    "odometry_frame",
+)
+
+
 def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSource:
     """`BAG[?camera=/TOPIC][&points=/TOPIC][&odometry=/TOPIC][&intrinsics=FILE or /TOPIC][&lidar_frame=NAME]
-    [&moving=PARENT,CHILD][&time=FIELD,UNIT[,BASE]][&lidar_source=N]`.
+    [&moving=PARENT,CHILD][&time=FIELD,UNIT[,BASE]][&lidar_source=N][&odometry_frame=NAME]`, and the keys of
+    `bag_recognition.Readings`.
 
     Without a query, a recorded window is opened as such. In any other bag:
 
@@ -42,7 +61,7 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
       and the points are moved back to it along `/tf_static`.
     - If no topic gives a velocity, the motion comes from the transforms of `/tf` between the frames that `moving` names
       (default: `odom` and `base_link`), else the rotation from an IMU. If `/tf_static` does not lead to the frame of
-      the odometry, its twist is taken as the LiDAR's own.
+      the motion, the motion is left out; `odometry_frame` names another frame for it.
     - `time` says how points are timed, if their values leave it open (see `config.PointTimeConfig`).
     - `lidar_source` chooses one LiDAR of a cloud of several (see `adapters.ros.source_field`).
 
@@ -51,19 +70,22 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
         SourceError: no bag, cut off or damaged; no topic, or several, of a type; no intrinsics, no extrinsic.
         WindowError: a recorded window is damaged.
     """
-    query = spec.only("camera", "points", "odometry", "intrinsics", "lidar_frame", "moving", "time", "lidar_source")
+    query = spec.only(*KEYS, *bag_recognition.READING_KEYS)
     if not query and spec.path.suffix == ".mcap" and is_window(spec.path):
         return _window_recording(spec.path)
     clouds, frames = (
         bag_index.CloudDecoder.from_query(query.get("time"), query.get("lidar_source")),
         _frames(query.get("moving")),
     )
+    readings = bag_recognition.Readings.from_query(query)
     storage = open_storage(spec.path)
     index = bag_index.build_index(storage, clouds)
     camera_topic = index.topic(bag_index.IMAGE_TYPES, query.get("camera"), "camera")
     lidar_topic = index.topic(bag_index.CLOUD_TYPES, query.get("points"), "points")
     with storage.open() as reader:
-        streams = _streams(index, reader, camera_topic, lidar_topic, (frames, query.get("odometry")))
+        streams, of_twists = _streams(
+            index, reader, camera_topic, lidar_topic, (frames, query.get("odometry")), readings
+        )
         camera = _load(storage, reader, streams.camera[0], clouds)
         cloud = _load(storage, reader, streams.lidar[0], clouds)
         motions = [*streams.moved[:1], *(_load(storage, reader, place, clouds) for place in streams.motion[:1])]
@@ -74,9 +96,46 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
     T_cloud_lidar = index.transform(cloud.frame_id, lidar_frame)
     if T_cloud_lidar is None:
         raise SourceError(f"{spec.path}: /tf_static does not connect {cloud.frame_id!r} and {lidar_frame!r}")
+    motion, unconnected = _connected(index, lidar_frame, motion, query.get("odometry_frame"))
+    if unconnected is not None:
+        streams = replace(streams, motion=[], moved=())
     rig = bag_index.rig_of_bag(index, query.get("intrinsics"), camera_topic, camera, lidar_frame, motion)
     name = f"{spec.path.name}{camera_topic}"
-    return BagRecording(name, rig, rig.T_camera_lidar_nominal, storage, streams, T_cloud_lidar, clouds)
+    recognised = tuple(one for one in (of_twists, unconnected) if one is not None)
+    recording = BagRecording(
+        name,
+        rig,
+        rig.T_camera_lidar_nominal,
+        storage,
+        streams,
+        T_cloud_lidar,
+        clouds,
+        readings,
+        cloud.frame_id,
+        recognised,
+    )
+    return recording.recognised()
+
+
+def _connected(
+    index: bag_index.BagIndex, lidar_frame: str, motion: EgoMotion | None, requested: str | None
+) -> tuple[EgoMotion | None, Recognition | None]:
+    """The motion, in the frame that was asked for; None if /tf_static does not connect its frame and the LiDAR's, and
+    what to tell of that.
+
+    Raises:
+        SourceError: /tf_static does not connect the frame that was asked for.
+    """
+    if motion is None or index.transform(lidar_frame, requested or motion.frame_id) is not None:
+        return motion if motion is None or requested is None else replace(motion, frame_id=requested), None
+    if requested is not None:
+        raise SourceError(f"{index.path}: /tf_static does not connect {requested!r} and {lidar_frame!r}")
+    text = (
+        f"The motion is that of the frame {motion.frame_id!a}, which /tf_static does not connect with "
+        f"{lidar_frame!a}: it is left out, and nothing is compensated for motion. Record /tf_static of the whole "
+        f"vehicle, or name a frame with its axes: ?odometry_frame=NAME ({lidar_frame}: the motion is the LiDAR's own)."
+    )
+    return None, Recognition("motion_frame_unconnected", text, "warn")
 
 
 def _window_recording(path: Path) -> recording_source.FramewiseRecording:
@@ -106,7 +165,7 @@ class PairStreams:
     """
 
     camera: list[bag_index.MessageLocation]
-    lidar: list[bag_index.MessageLocation]
+    lidar: list[Sweep]
     motion: list[bag_index.MessageLocation]
     moved: tuple[EgoMotion, ...] = ()
 
@@ -125,6 +184,10 @@ class BagRecording:
         streams: places of the messages.
         T_cloud_lidar: (4, 4) pose of the LiDAR in the frame in which the points are given.
         clouds: how the clouds are read.
+        readings: what a person said of the bag.
+        cloud_frame: frame in which the points are given.
+        recognitions: what was recognised of the bag.
+        compensated: instant for which the points were compensated before they were recorded; None: for none.
     """
 
     name: str
@@ -134,6 +197,10 @@ class BagRecording:
     streams: PairStreams
     T_cloud_lidar: Matrix4
     clouds: bag_index.CloudDecoder
+    readings: bag_recognition.Readings
+    cloud_frame: str
+    recognitions: tuple[Recognition, ...] = ()
+    compensated: str | None = None
     configuration: CalibrationConfig | None = None
 
     @property
@@ -174,18 +241,94 @@ class BagRecording:
             for *_, item in sorted(queue, key=lambda entry: entry[:3]):
                 if isinstance(item, EgoMotion):
                     yield item
-                    continue
-                message = _load(self.storage, reader, item, self.clouds)
-                yield self._from_origin(message) if isinstance(message, LidarFrame) else message
+                elif isinstance(item, Sweep):
+                    yield self._sweep(reader, item)
+                else:
+                    message = _load(self.storage, reader, item, self.clouds)
+                    yield replace(message, stamp_ns=item.stamp_ns) if isinstance(message, CameraFrame) else message
 
-    def _from_origin(self, cloud: LidarFrame) -> LidarFrame:
-        return measured_from(cloud, self.T_cloud_lidar, self.rig.lidar_frame, self.storage.path, _ADVICE)
+    def recognised(self) -> BagRecording:
+        """The recording with its sweeps as their points show them: clouds that are parts of a turn are joined, and
+        points that were compensated for motion already have one time.
+
+        Raises:
+            SourceError: a cloud cannot be read.
+        """
+        said = self.readings
+        with self.storage.open() as reader:
+
+            def load(place: bag_index.MessageLocation) -> LidarFrame:
+                return self._cloud(reader, place)
+
+            sweeps, of_clouds = bag_recognition.sweeps_of_clouds(self._clouds(), load, said.clouds)
+            streams = _shifted(replace(self.streams, lidar=sweeps), said)
+            recording = replace(self, streams=streams, recognitions=(*self.recognitions, *of_clouds))
+            instant, of_points = said.compensated, None
+            if instant is None and sweeps:
+                instant, of_points = recording._compensated(reader)
+        recognitions = (*recording.recognitions, *(() if of_points is None else (of_points,)))
+        return replace(recording, recognitions=recognitions, compensated=instant or None)
+
+    def _clouds(self) -> list[bag_index.MessageLocation]:
+        return [cloud for sweep in self.streams.lidar for cloud in sweep.clouds]
+
+    def _compensated(self, reader: BagReader) -> tuple[str | None, Recognition | None]:
+        """See `bag_recognition.compensated`, of some sweeps."""
+        sweeps = self.streams.lidar
+        chosen = [sweeps[index] for index in evenly_spread(len(sweeps), bag_recognition.SAMPLED_SWEEPS)]
+        stamps_ns = [sweep.stamp_ns for sweep in chosen]
+        motions = [
+            motion if isinstance(motion, EgoMotion) else _load(self.storage, reader, motion, self.clouds)
+            for motion in self.streams.motions
+            if any(abs(motion.stamp_ns - stamp_ns) <= recording_source.MOTION_REACH_NS // 5 for stamp_ns in stamps_ns)
+        ]
+        known = [motion for motion in motions if isinstance(motion, EgoMotion)]
+        if not known:
+            return None, None
+        return bag_recognition.compensated((self._sweep(reader, one) for one in chosen), known, self.rig.T_lidar_ego)
+
+    def _cloud(self, reader: BagReader, place: bag_index.MessageLocation) -> LidarFrame:
+        cloud = _load(self.storage, reader, place, self.clouds)
+        if not isinstance(cloud, LidarFrame):
+            raise SourceError(f"{self.storage.path}: the {place.type_name} of {place.stamp_ns} ns is no cloud")
+        if cloud.frame_id != self.cloud_frame:
+            raise SourceError(
+                f"{self.storage.path}: the clouds of one topic are given in the frames {self.cloud_frame!a} and "
+                f"{cloud.frame_id!a}: two LiDARs publish on it; let each have a topic of its own, and record again"
+            )
+        return cloud
+
+    def _sweep(self, reader: BagReader, place: Sweep) -> LidarFrame:
+        clouds = [self._cloud(reader, cloud) for cloud in place.clouds]
+        middle_ns = clouds[len(clouds) // 2].stamp_ns
+        sweep = replace(bag_recognition.joined(clouds, middle_ns), stamp_ns=place.stamp_ns)
+        sweep = sweep if self.compensated is None else bag_recognition.as_compensated(sweep, self.compensated)
+        if self.readings.rings is False:
+            sweep = replace(sweep, ring=None)
+        return measured_from(
+            sweep, self.T_cloud_lidar, self.rig.lidar_frame, self.storage.path, _ADVICE, self.readings.rings is True
+        )
+
+
+def _shifted(streams: PairStreams, said: bag_recognition.Readings) -> PairStreams:
+    """The streams with their stamps corrected."""
+    return replace(
+        streams,
+        camera=[replace(place, stamp_ns=place.stamp_ns + said.camera_offset_ns) for place in streams.camera],
+        lidar=[replace(place, stamp_ns=place.stamp_ns + said.lidar_offset_ns) for place in streams.lidar],
+    )
 
 
 def _streams(
-    index: bag_index.BagIndex, reader: BagReader, camera: str, lidar: str, motion: tuple[tuple[str, str], str | None]
-) -> PairStreams:
-    """The streams of the pair. `motion`: the vehicle's frames, and the topic that was asked for."""
+    index: bag_index.BagIndex,
+    reader: BagReader,
+    camera: str,
+    lidar: str,
+    motion: tuple[tuple[str, str], str | None],
+    said: bag_recognition.Readings,
+) -> tuple[PairStreams, Recognition | None]:
+    """The streams of the pair, each cloud a sweep, and what to tell of the motion. `motion`: the vehicle's frames, and
+    the topic that was asked for."""
     frames, requested = motion
     motion_source = bag_index.motion_topic(index, reader, frames, requested)
     places = index.streams[motion_source].ordered() if motion_source in index.streams else []
@@ -196,7 +339,12 @@ def _streams(
     )
     for topic in (camera, lidar):
         _require_stamps(index, topic)
-    return PairStreams(index.streams[camera].ordered(), index.streams[lidar].ordered(), places, moved)
+    of_twists = None
+    if places and places[0].type_name == messages.ODOMETRY:
+        by_poses, of_twists = bag_recognition.motion_of_odometry(reader, places, said.motion)
+        places, moved = (places, moved) if by_poses is None else ([], by_poses)
+    sweeps = [Sweep(place.stamp_ns, place.at, place.type_name, (place,)) for place in index.streams[lidar].ordered()]
+    return PairStreams(index.streams[camera].ordered(), sweeps, places, moved), of_twists
 
 
 def _require_stamps(index: bag_index.BagIndex, topic: str) -> None:

@@ -342,9 +342,15 @@ of a metre has a thousand."""
 
 
 def measured_from(
-    cloud: LidarFrame, T_cloud_lidar: Matrix4, frame_id: str, where: Path, advice: Mapping[str, str]
+    cloud: LidarFrame,
+    T_cloud_lidar: Matrix4,
+    frame_id: str,
+    where: Path,
+    advice: Mapping[str, str],
+    has_scan_lines: bool = False,
 ) -> LidarFrame:
-    """A sweep in the LiDAR's own frame, see `from_origin`; without ring numbers that are no scan lines.
+    """A sweep in the LiDAR's own frame, see `from_origin`; without ring numbers that are no scan lines, unless
+    a person says that they are (`has_scan_lines`).
 
     Raises:
         SourceError: the points are in millimetres, or were not measured from the origin of that frame. The message of
@@ -361,7 +367,7 @@ def measured_from(
     contradiction = check.inspect(sweep)
     if contradiction is not None:
         raise SourceError(f"{where}: {contradiction.sentence} {advice[contradiction.cause]}")
-    return sweep if check.has_scan_lines(sweep) else unordered(sweep)
+    return sweep if has_scan_lines or check.has_scan_lines(sweep) else unordered(sweep)
 
 
 def _frame(stamp_ns: int, frame_id: str, path: Path, columns: Columns) -> LidarFrame:

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 from urllib.parse import parse_qsl
 
+import numpy as np
+
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Recognition, Rig
 from coec.config import CalibrationConfig
 from coec.errors import UsageError
@@ -169,6 +171,14 @@ def selected_indices(cameras: Collection[int] | None, count: int) -> list[int]:
         if not 0 <= index < count:
             raise UsageError(f"there is no camera frame {index}: the recording has {count}, counted from 0")
     return sorted(set(cameras))
+
+
+def evenly_spread(count: int, limit: int) -> list[int]:
+    """At most `limit` of `count` indices, evenly spread. They include the first and the last; a single one is the
+    first."""
+    if limit >= count:
+        return list(range(count))
+    return sorted({round(index) for index in np.linspace(0, count - 1, limit)})
 
 
 def motions_near(motions: Collection[EgoMotion], stamps_ns: Collection[int]) -> list[EgoMotion]:

@@ -21,7 +21,7 @@ from coec.geometry.projection import half_field_of_view_rad
 from coec.io.images import CompressingReducer
 from coec.io.mcap.window_reader import is_window, read_result, read_window
 from coec.io.recordings.layouts import RecordingSource, open_source
-from coec.io.recordings.recording_source import parse_spec, recognitions_of
+from coec.io.recordings.recording_source import evenly_spread, parse_spec, recognitions_of
 
 WHOLE = (0.0, math.inf)
 """Begin and end of the whole recording, in seconds after the first camera frame."""
@@ -153,10 +153,10 @@ def _offset_text(offset_s: float, camera_s: float, sweep_s: float) -> str:
     added = f"{-round(offset_s):d}" if exact else "SECONDS"
     return (
         f"the clouds are {abs(offset_s):.3f} s {'ahead of' if offset_s > 0 else 'behind'} the images{cause}: "
-        f"the images begin at {_begin(camera_s)}, the clouds at {_begin(sweep_s)}. The stamps must be of one clock: let "
-        "both drivers take the computer's time, or synchronise the sensors (PTP), and record again; where the difference "
-        f"is known, correct the stamps of one stream, of a bag with ?lidar_offset={added}, which is added to those of "
-        "the clouds"
+        f"the images begin at {_begin(camera_s)}, the clouds at {_begin(sweep_s)}. The stamps must be of one clock: "
+        "let both drivers take the computer's time, or synchronise the sensors (PTP), and record again; where the "
+        f"difference is known, correct the stamps of one stream, of a bag with ?lidar_offset={added}, which is added "
+        "to those of the clouds"
     )
 
 
@@ -205,14 +205,6 @@ def offset_cause(offset_s: float, camera_s: float, sweep_s: float) -> str:
         return " (one of the two is probably stamped when it was received, not when it was measured)"
     scale = next((name for gap_s, name in TIME_SCALES_S.items() if abs(abs(offset_s) - gap_s) < 0.5), None)
     return "" if scale is None else f" (this is {scale})"
-
-
-def evenly_spread(count: int, limit: int) -> list[int]:
-    """At most `wanted` of `count` indices, evenly spread. They include the first and the last; a single one is the
-    first."""
-    if limit >= count:
-        return list(range(count))
-    return sorted({round(index) for index in np.linspace(0, count - 1, limit)})
 
 
 def parse_perturbation(option: str, text: str) -> NDArray[np.float64]:

@@ -104,7 +104,7 @@ def odometry(payload: bytes) -> EgoMotion:
     Raises:
         DecodeError: the reasons of `checked`, or not this message.
     """
-    _check(payload)
+    check_motion(payload)
     message = deserialized(ros.nav_msgs__msg__Odometry, payload)
     return _twisted(message.header, message.child_frame_id or message.header.frame_id, message.twist.twist)
 
@@ -115,7 +115,7 @@ def twist(payload: bytes) -> EgoMotion:
     Raises:
         DecodeError: the reasons of `checked`, or not this message.
     """
-    _check(payload)
+    check_motion(payload)
     message = deserialized(ros.geometry_msgs__msg__TwistStamped, payload)
     return _twisted(message.header, message.header.frame_id, message.twist)
 
@@ -126,7 +126,7 @@ def twist_with_covariance(payload: bytes) -> EgoMotion:
     Raises:
         DecodeError: the reasons of `checked`, or not this message.
     """
-    _check(payload)
+    check_motion(payload)
     message = deserialized(ros.geometry_msgs__msg__TwistWithCovarianceStamped, payload)
     return _twisted(message.header, message.header.frame_id, message.twist.twist)
 
@@ -137,7 +137,7 @@ def imu(payload: bytes) -> EgoMotion:
     Raises:
         DecodeError: the reasons of `checked`, not this message, or the IMU says that it does not measure turn rates.
     """
-    _check(payload)
+    check_motion(payload)
     message = deserialized(ros.sensor_msgs__msg__Imu, payload)
     if message.angular_velocity_covariance[0] == -1.0:  # sensor_msgs/Imu: "does not produce" it
         raise DecodeError(Refusal.MOTION_INVALID, "the IMU says that it does not measure turn rates")
@@ -162,7 +162,8 @@ def _twisted(header: ros.std_msgs__msg__Header, frame: str, twist: ros.geometry_
     return checked(stamp_ns(header), frame_id(frame), (linear.x, linear.y, linear.z), (angular.x, angular.y, angular.z))
 
 
-def _check(payload: bytes) -> None:
+def check_motion(payload: bytes) -> None:
+    """Raises DecodeError if the payload is too long for a message of motion, or does not begin with a header."""
     if len(payload) > MAX_MOTION_BYTES:
         raise DecodeError(Refusal.MESSAGE_TOO_LARGE, f"a message of motion has at most {MAX_MOTION_BYTES} bytes")
     check_header(payload)

@@ -23,7 +23,7 @@ from coec.errors import DecodeError
 from coec.geometry import se3
 from coec.geometry.se3 import inverse, rotation_from_quaternion_xyzw, transform_from
 from coec.io.frame_validation import MAX_FRAME_ID, Refusal
-from coec.io.ros.message_decoding import checked
+from coec.io.ros.message_decoding import check_motion, checked
 from coec.io.ros.messages import MessageCursor, deserialized, frame_id, stamp_ns
 
 MAX_TRANSFORMS: Final = 2048
@@ -68,6 +68,24 @@ def pose_of(stamped: Any) -> Matrix4:
     except ValueError as error:
         raise DecodeError(Refusal.TRANSFORM_INVALID, f"not a rigid transform: {error}") from error
     return transform_from(turn, place_m)
+
+
+def odometry_pose(payload: bytes) -> Matrix4 | None:
+    """T_parent_child (4, 4) of an `Odometry`, the pose of the frame in which its twist is expressed; None if it is not
+    filled in.
+
+    Raises:
+        DecodeError: not this message.
+    """
+    check_motion(payload)
+    pose = deserialized(ros.nav_msgs__msg__Odometry, payload).pose.pose
+    place_m = np.array([pose.position.x, pose.position.y, pose.position.z])
+    turned = pose.orientation
+    try:
+        rotation = rotation_from_quaternion_xyzw(np.array([turned.x, turned.y, turned.z, turned.w]))
+    except ValueError:
+        return None
+    return transform_from(rotation, place_m) if (np.abs(place_m) <= MAX_PLACE_M).all() else None
 
 
 def bare(frame_id: str) -> str:

@@ -1,0 +1,131 @@
+"""How the velocities of an odometry are meant, from the poses in the same messages.
+
+`nav_msgs/Odometry` has both: the pose of the child frame in the parent frame, and the velocity in the child frame.
+Programs fill in one of them only, or give the velocity in the parent frame, or backwards. For two poses T₁ and T₂, dt
+apart, the velocity in the child frame is log(T₁⁻¹·T₂)/dt, at the middle between the two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.types import EgoMotion, Matrix4
+from coec.geometry import se3
+
+LEAST_S, MOST_S = 0.1, 0.5
+"""Time between the two poses of a difference: over less, the millimetres of a filter are velocities; over more, the
+velocity changes unnoticed."""
+
+MOVING_MPS, STANDING_MPS = 0.5, 0.05
+"""Speeds, by the poses or by the velocities, from which on a vehicle moves, and below which it stands."""
+
+LEAST_MOVES = 5
+"""Fewer differences while the vehicle moves show nothing."""
+
+FITTING, CLEARLY = 0.2, 2.0
+"""A reading fits if it is off by at most this share of the speed, in the median; and it counts if the velocity as
+stated is off by so many times more. See docs/measured.md."""
+
+
+class TwistReading(StrEnum):
+    """What the poses show of the velocities."""
+
+    AS_STATED = "as stated"
+    NOT_FILLED_IN = "not filled in"
+    PARENT_FRAME = "in the parent frame, not in the child frame"
+    BACKWARDS = "backwards"
+    CONTRADICTED = "contradicted by the poses"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseAndTwist:
+    """One message: the pose of the child in its parent (4, 4), None if it is invalid; and the motion as stated."""
+
+    T_parent_child: Matrix4 | None
+    motion: EgoMotion
+
+    @property
+    def stamp_ns(self) -> int:
+        """Nanoseconds."""
+        return self.motion.stamp_ns
+
+
+def reading_of_twists(messages: Sequence[PoseAndTwist]) -> TwistReading:
+    """How velocities are meant. `messages` are in the order of their stamps, and may have gaps. `AS_STATED` also where
+    nothing can be told: poses that are not filled in, a vehicle that stands."""
+    moved, stated, turned = _compared(messages)
+    speed_mps = np.linalg.norm(moved, axis=1)
+    moving = speed_mps >= MOVING_MPS
+    if moving.sum() < LEAST_MOVES:
+        return TwistReading.AS_STATED
+    moved, stated, turned, speed_mps = (values[moving] for values in (moved, stated, turned, speed_mps))
+    if np.median(np.linalg.norm(stated, axis=1)) <= STANDING_MPS:
+        return TwistReading.NOT_FILLED_IN
+    in_child = np.einsum("nji,nj->ni", turned, stated)
+    off = {
+        TwistReading.AS_STATED: stated,
+        TwistReading.PARENT_FRAME: in_child,
+        TwistReading.BACKWARDS: -stated,
+    }
+    shares = {
+        reading: float(np.median(np.linalg.norm(velocity - moved, axis=1) / speed_mps))
+        for reading, velocity in off.items()
+    }
+    best = min(shares, key=lambda reading: shares[reading])
+    if shares[best] > FITTING:
+        return TwistReading.CONTRADICTED
+    return best if CLEARLY * shares[best] <= shares[TwistReading.AS_STATED] else TwistReading.AS_STATED
+
+
+def motions_of_poses(messages: Sequence[PoseAndTwist]) -> tuple[EgoMotion, ...]:
+    """The motion as differences of poses, in the order of stamps."""
+    motions = []
+    for first, last in _intervals(messages):
+        a, b = messages[first], messages[last]
+        assert a.T_parent_child is not None
+        assert b.T_parent_child is not None
+        between_s = (b.stamp_ns - a.stamp_ns) * 1e-9
+        wx, wy, wz, vx, vy, vz = (se3.log(se3.inverse(a.T_parent_child) @ b.T_parent_child) / between_s).tolist()
+        middle_ns = a.stamp_ns + (b.stamp_ns - a.stamp_ns) // 2
+        motions.append(EgoMotion(middle_ns, a.motion.frame_id, (vx, vy, vz), (wx, wy, wz)))
+    return tuple(motions)
+
+
+def _intervals(messages: Sequence[PoseAndTwist]) -> list[tuple[int, int]]:
+    """For each message with a pose the first one with a pose that is at least `LEAST_S` later, if it is near enough."""
+    posed = [index for index, message in enumerate(messages) if message.T_parent_child is not None]
+    found, later = [], 0
+    for place, first in enumerate(posed):
+        later = max(later, place + 1)
+        while later < len(posed) and messages[posed[later]].stamp_ns - messages[first].stamp_ns < LEAST_S * 1e9:
+            later += 1
+        if later == len(posed):
+            break
+        if messages[posed[later]].stamp_ns - messages[first].stamp_ns <= MOST_S * 1e9:
+            found.append((first, posed[later]))
+    return found
+
+
+def _compared(messages: Sequence[PoseAndTwist]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """(N, 3) linear velocities in the child frame by the poses, (N, 3) as stated, m/s, and (N, 3, 3) the rotation from
+    child to parent."""
+    moved, stated, turned = [], [], []
+    for motion, (first, last) in zip(motions_of_poses(messages), _intervals(messages), strict=True):
+        a, b = messages[first], messages[last]
+        if a.motion.linear_mps is None or b.motion.linear_mps is None or a.T_parent_child is None:
+            continue
+        moved.append(motion.linear_mps)
+        stated.append(0.5 * (np.array(a.motion.linear_mps) + np.array(b.motion.linear_mps)))
+        half = se3.rotation_exp(0.5e-9 * (b.stamp_ns - a.stamp_ns) * np.array(motion.angular_radps))
+        turned.append(a.T_parent_child[:3, :3] @ half)
+    shape = (len(moved), 3)
+    return (
+        np.array(moved, np.float64).reshape(shape),
+        np.array(stated, np.float64).reshape(shape),
+        np.array(turned, np.float64).reshape(*shape, 3),
+    )

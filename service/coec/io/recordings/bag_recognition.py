@@ -1,0 +1,298 @@
+"""What the messages of a bag show of how they are meant: the velocities of an odometry, clouds that are parts of a
+turn, and points that were compensated for motion before they were recorded.
+
+A person can say otherwise in the query of the bag; every recognition names the key.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any, Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.frames.motion_evidence import (
+    LEAST_S,
+    PoseAndTwist,
+    TwistReading,
+    motions_of_poses,
+    reading_of_twists,
+)
+from coec.calibration.frames.pairing import motion_at
+from coec.calibration.frames.sweep_evidence import (
+    LEAST_SPEED_MPS,
+    MOST_CLOUDS,
+    SAME,
+    SECTORS,
+    WHOLE,
+    clouds_in_turn,
+    compensated_for,
+    instants_s,
+    sectors,
+)
+from coec.calibration.types import EgoMotion, LidarFrame, Matrix4, Recognition
+from coec.errors import DecodeError, SourceError, UsageError
+from coec.io.recordings.bag_index import MessageLocation
+from coec.io.recordings.bag_storage import BagReader
+from coec.io.recordings.recording_source import MOTION_REACH_NS, evenly_spread
+from coec.io.ros import message_decoding, messages
+from coec.io.ros.transforms import odometry_pose
+
+MAX_OFFSET_S: Final = 1e10
+"""Largest correction of stamps, s: from nanoseconds since 1970 that were read as seconds nothing can be corrected."""
+
+SAMPLED_MOVES, MOST_BETWEEN = 40, 64
+"""Messages of an odometry whose poses and velocities are compared, evenly chosen, each with those up to the next pose,
+at most so many."""
+
+OVERLAPPING: Final = 1.3
+"""Parts of one turn last no longer than so many times their distance; clouds of two LiDARs overlap in time."""
+
+Value = TypeVar("Value")
+
+SAMPLED_SWEEPS: Final = 6
+"""Sweeps that are looked at for compensation."""
+
+GAP: Final = 3.0
+"""Clouds that are parts of one turn follow each other; a gap of so many median intervals ends a turn."""
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """What a person says of a bag; None: it is recognised.
+
+    Attributes:
+        rings: whether ring numbers are scan lines.
+        compensated: the instant for which points were compensated, see `sweep_evidence`; empty: for none.
+        clouds: how many clouds make a sweep.
+        motion: `twist` or `pose`: from what of an odometry the motion comes.
+        camera_offset_ns, lidar_offset_ns: added to the stamps.
+    """
+
+    rings: bool | None = None
+    compensated: str | None = None
+    clouds: int | None = None
+    motion: str | None = None
+    camera_offset_ns: int = 0
+    lidar_offset_ns: int = 0
+
+    @classmethod
+    def from_query(cls, query: dict[str, str]) -> Readings:
+        """From the keys of a query; others are ignored.
+
+        Raises:
+            UsageError: a value does not fit.
+        """
+        return cls(
+            _chosen(query, "rings", {"lines": True, "none": False}),
+            _chosen(query, "compensated", {"no": "", **{name: name for name in ("stamp", "begin", "middle", "end")}}),
+            _chosen(query, "clouds_per_sweep", {str(count): count for count in range(1, MOST_CLOUDS + 1)}),
+            _chosen(query, "motion", {"twist": "twist", "pose": "pose"}),
+            _offset_ns(query, "camera_offset"),
+            _offset_ns(query, "lidar_offset"),
+        )
+
+
+READING_KEYS: Final = ("rings", "compensated", "clouds_per_sweep", "motion", "camera_offset", "lidar_offset")
+"""The keys that `Readings` reads."""
+
+
+def _chosen(query: dict[str, str], key: str, values: dict[str, Value]) -> Value | None:
+    if key not in query:
+        return None
+    if query[key] not in values:
+        names = list(values)
+        accepted = ", ".join(names) if len(names) < MOST_CLOUDS else f"{names[0]} to {names[-1]}"
+        raise UsageError(f"{key}={query[key]}: it is one of {accepted}")
+    return values[query[key]]
+
+
+def _offset_ns(query: dict[str, str], key: str) -> int:
+    try:
+        offset_s = float(query.get(key, "0"))
+    except ValueError:
+        offset_s = float("nan")
+    if not abs(offset_s) <= MAX_OFFSET_S:
+        raise UsageError(f"{key}={query[key]}: seconds that are added to the stamps, as {key}=-0.03")
+    return round(offset_s * 1e9)
+
+
+def motion_of_odometry(
+    reader: BagReader, places: Sequence[MessageLocation], motion: str | None
+) -> tuple[tuple[EgoMotion, ...] | None, Recognition | None]:
+    """The motion by the poses of an odometry, if its velocities are not meant as stated or `motion` is `pose`; None:
+    by its velocities. And what to tell.
+
+    Raises:
+        SourceError: a message is no odometry.
+    """
+    if motion == "twist":
+        return None, None
+    if motion == "pose":
+        return motions_of_poses([_posed(reader, place) for place in places]), None
+    sampled = [_posed(reader, places[index]) for index in _near_each_other(places)]
+    reading = reading_of_twists(sampled)
+    if reading is TwistReading.AS_STATED:
+        return None, None
+    if reading is TwistReading.CONTRADICTED:
+        text = (
+            "The velocities of the odometry do not fit its poses; the velocities are used. If the poses are right, say "
+            "?motion=pose; ?motion=twist leaves out this line."
+        )
+        return None, Recognition("twist_contradicted", text, "warn")
+    text = (
+        f"The velocities of the odometry are {reading}, by its poses: the motion is taken from the differences of the "
+        "poses. If the velocities are right, say ?motion=twist."
+    )
+    return motions_of_poses([_posed(reader, place) for place in places]), Recognition("twist_from_poses", text)
+
+
+def _near_each_other(places: Sequence[MessageLocation]) -> list[int]:
+    """Indices of some messages, and of those that follow each until poses are far enough apart."""
+    chosen: set[int] = set()
+    for start in evenly_spread(len(places), SAMPLED_MOVES):
+        for index in range(start, min(start + MOST_BETWEEN, len(places))):
+            chosen.add(index)
+            if places[index].stamp_ns - places[start].stamp_ns >= LEAST_S * 1e9:
+                break
+    return sorted(chosen)
+
+
+def _posed(reader: BagReader, place: MessageLocation) -> PoseAndTwist:
+    payload = reader.read(place.at)
+    try:
+        return PoseAndTwist(odometry_pose(payload), message_decoding.odometry(payload))
+    except DecodeError as error:
+        raise SourceError(f"the {messages.ODOMETRY} of {place.stamp_ns} ns: {error}") from error
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Sweep(MessageLocation):
+    """A sweep: its cloud, or the clouds of which it consists, in the order of their stamps. Its stamp is that of the
+    middle one."""
+
+    clouds: tuple[MessageLocation, ...] = field(default=(), compare=False)
+
+
+def sweeps_of_clouds(
+    places: Sequence[MessageLocation], load: Callable[[MessageLocation], LidarFrame], clouds: int | None
+) -> tuple[list[Sweep], tuple[Recognition, ...]]:
+    """The sweeps that clouds make up, each alone or some of them a turn; and what to tell.
+
+    Args:
+        places: of the clouds, in the order of their stamps.
+        load: a cloud.
+        clouds: how many clouds make up a sweep; None: it is recognised.
+    """
+    alone = [Sweep(place.stamp_ns, place.at, place.type_name, (place,)) for place in places]
+    if clouds is not None:
+        return (alone if clouds == 1 else _joined(places, clouds)), ()
+    seen = [load(place) for place in places[:1]]
+    if not seen or sectors(seen[0]).sum() >= WHOLE * SECTORS:
+        return alone, ()
+    # A LiDAR that does not turn shows the same sectors at once.
+    for count in (4, MOST_CLOUDS):
+        seen += [load(place) for place in places[len(seen) : count]]
+        in_turn = clouds_in_turn([sectors(one) for one in seen])
+        if in_turn == 1 and not _turning(seen):
+            return alone, ()
+    if in_turn == 1:
+        return alone, ()
+    degrees = 360 * float(np.median([sectors(one).sum() for one in seen])) / SECTORS
+    what = f"Each cloud covers {degrees:.0f} degrees of the turn, {in_turn} in a row the whole"
+    timed = [float(np.ptp(one.time_offset_s)) for one in seen if one.time_offset_s is not None]
+    apart_s = float(np.median(np.diff([one.stamp_ns for one in seen]))) * 1e-9
+    one_after_the_other = timed and float(np.median(timed)) <= OVERLAPPING * apart_s
+    if not one_after_the_other and (timed or in_turn == 2):
+        text = (
+            f"{what}, but at the same time: perhaps two LiDARs publish on the topic. Record a topic for each; if the "
+            f"clouds are parts of one turn, say ?clouds_per_sweep={in_turn}, if not, ?clouds_per_sweep=1."
+        )
+        return alone, (Recognition("several_lidars", text, "warn"),)
+    text = (
+        f"{what}: {in_turn} clouds are joined to a sweep. Let the driver send whole turns (Velodyne: npackets, rpm, "
+        "cut_angle), which the service needs; ?clouds_per_sweep=1 takes each cloud as a sweep."
+    )
+    return _joined(places, in_turn), (Recognition("partial_clouds", text, "warn"),)
+
+
+def _turning(seen: Sequence[LidarFrame]) -> bool:
+    """Whether clouds look into different directions."""
+    covered = [sectors(one) for one in seen]
+    return bool(np.any(covered, axis=0).sum() > SAME * np.median([one.sum() for one in covered]))
+
+
+def _joined(places: Sequence[MessageLocation], count: int) -> list[Sweep]:
+    """Each `count` clouds in a row; those before a gap, or at the end, that make up no turn are left out."""
+    gaps_ns = [later.stamp_ns - earlier.stamp_ns for earlier, later in pairwise(places)]
+    longest_ns = GAP * float(np.median(gaps_ns)) if gaps_ns else 0.0
+    sweeps: list[Sweep] = []
+    row: list[MessageLocation] = []
+    for place in places:
+        if row and place.stamp_ns - row[-1].stamp_ns > longest_ns:
+            row = []
+        row.append(place)
+        if len(row) == count:
+            middle = row[count // 2]
+            sweeps.append(Sweep(middle.stamp_ns, middle.at, middle.type_name, tuple(row)))
+            row = []
+    return sweeps
+
+
+def joined(clouds: Sequence[LidarFrame], stamp_ns: int) -> LidarFrame:
+    """One sweep of the points of some clouds, with this stamp. The points of a cloud without times have that of its
+    stamp."""
+    first, *others = clouds
+    if not others:
+        return first
+
+    def column(name: str) -> NDArray[Any] | None:
+        values = [getattr(cloud, name) for cloud in clouds]
+        return None if any(of_cloud is None for of_cloud in values) else np.concatenate(values)
+
+    times_s = [
+        (np.zeros(len(cloud.xyz_m)) if cloud.time_offset_s is None else cloud.time_offset_s)
+        + (cloud.stamp_ns - stamp_ns) * 1e-9
+        for cloud in clouds
+    ]
+    return replace(
+        first,
+        stamp_ns=stamp_ns,
+        xyz_m=np.concatenate([cloud.xyz_m for cloud in clouds]),
+        intensity=column("intensity"),
+        ring=column("ring"),
+        time_offset_s=np.concatenate(times_s).astype(np.float32),
+        not_finite=sum(cloud.not_finite for cloud in clouds),
+        sequence=None,
+    )
+
+
+def compensated(
+    sweeps: Iterator[LidarFrame], motions: Sequence[EgoMotion], T_lidar_ego: Matrix4
+) -> tuple[str | None, Recognition | None]:
+    """The instant for which the points of these sweeps were compensated before they were recorded, as a name in
+    `sweep_evidence.instants_s`, None: for none; and what to tell."""
+    moving = []
+    for sweep in sweeps:
+        motion = motion_at(motions, sweep.stamp_ns, MOTION_REACH_NS // 5)
+        if motion is not None and motion.reaches(LEAST_SPEED_MPS):
+            moving.append((sweep, motion))
+    instant = compensated_for(moving, T_lidar_ego)
+    if instant is None:
+        return None, None
+    text = (
+        f"The points were compensated for motion before they were recorded, for the {instant} of each sweep, because "
+        "undoing that makes their turn even: they are not compensated again. If that is wrong, say ?compensated=no."
+    )
+    return instant, Recognition("already_compensated", text)
+
+
+def as_compensated(sweep: LidarFrame, instant: str) -> LidarFrame:
+    """The sweep, all its points at the instant for which they were compensated."""
+    at_s = instants_s(sweep).get(instant)
+    if at_s is None:
+        return sweep
+    return replace(sweep, time_offset_s=np.full(len(sweep.xyz_m), at_s, np.float32))
