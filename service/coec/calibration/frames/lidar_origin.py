@@ -27,7 +27,10 @@ from coec.calibration.types import LidarFrame, Matrix4, Recognition
 Doubles = NDArray[np.float64]
 
 MIN_RINGS, MIN_POINTS = 4, 12
-"""Fewer rings, or fewer points of a ring, say nothing."""
+"""Fewer rings, or fewer points of a ring, do not show where they were measured from."""
+
+FEW_RINGS, FEW_POINTS = 2, 4
+"""Fewer rings, or fewer points of a ring, do not show whether they are rings."""
 
 STEPS, STEP = 16, 1e-3
 """Most steps of the search, and its difference step: metres, and slopes of the axis."""
@@ -63,7 +66,7 @@ class Rings:
         """The rings among points (N, 3) with the ring names of the sensor (N,); None if there are fewer than `least`
         rings."""
         names, number, count = np.unique(ring, return_inverse=True, return_counts=True)
-        full = count >= MIN_POINTS
+        full = count >= (MIN_POINTS if least >= MIN_RINGS else FEW_POINTS)
         if full.sum() < least:
             return None
         keep = full[number]
@@ -347,7 +350,7 @@ class OriginCheck:
         """Whether the ring numbers of a sweep, which was inspected or follows one that was, are scan lines: each with
         its own elevation, seen from the stated origin or from where the inspected sweep was measured. True where too
         few points tell."""
-        rings = _rings(sweep, 2)
+        rings = _rings(sweep, FEW_RINGS)
         return rings is None or any(
             rings.are_told_apart(cones) for cones in (np.zeros(5), self._cones) if cones is not None
         )

@@ -39,6 +39,7 @@ class TwistReading(StrEnum):
     NOT_FILLED_IN = "not filled in"
     PARENT_FRAME = "in the parent frame, not in the child frame"
     BACKWARDS = "backwards"
+    KM_PER_H = "in km/h"
     CONTRADICTED = "contradicted by the poses"
 
 
@@ -71,6 +72,7 @@ def reading_of_twists(messages: Sequence[PoseAndTwist]) -> TwistReading:
         TwistReading.AS_STATED: stated,
         TwistReading.PARENT_FRAME: in_child,
         TwistReading.BACKWARDS: -stated,
+        TwistReading.KM_PER_H: stated / 3.6,
     }
     shares = {
         reading: float(np.median(np.linalg.norm(velocity - moved, axis=1) / speed_mps))

@@ -125,6 +125,6 @@ def clouds_in_turn(covered: Sequence[NDArray[np.bool_]]) -> int:
         return 1
     for count in range(2, len(covered) // 2 + 1):
         turns = [np.any(covered[first : first + count], axis=0).sum() for first in range(len(covered) - count + 1)]
-        if np.mean(np.array(turns) >= COVERING * whole) >= COVERING:
+        if np.mean(np.array(turns) >= COVERING * whole) >= AGREEING:
             return count
     return 1

@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from coec.calibration.frames.lidar_origin import ApparentOrigin, SeveralOrigins
+from coec.calibration.frames.lidar_origin import NO_SCAN_LINES, ApparentOrigin, SeveralOrigins
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Recognition, Rig
 from coec.config import CalibrationConfig
 from coec.errors import DecodeError, SourceError, UsageError
@@ -28,7 +28,8 @@ _EGO, _LIDAR, _CAMERA = 0, 1, 2
 
 
 _ADVICE = {
-    ApparentOrigin.cause: "Name the LiDAR's frame with ?lidar_frame=..., if /tf_static has it.",
+    ApparentOrigin.cause: "Name the LiDAR's frame with ?lidar_frame=..., if /tf_static has it. If only some of the "
+    "clouds look so, two LiDARs publish on the topic: let each have its own, and record again.",
     SeveralOrigins.cause: "Choose the topic of one LiDAR with ?points=..., or one by its number with ?lidar_source=N, "
     "if a field of the points tells it.",
 }
@@ -263,6 +264,9 @@ class BagRecording:
             sweeps, of_clouds = bag_recognition.sweeps_of_clouds(self._clouds(), load, said.clouds)
             streams = _shifted(replace(self.streams, lidar=sweeps), said)
             recording = replace(self, streams=streams, recognitions=(*self.recognitions, *of_clouds))
+            if said.rings is None and recording._is_unordered(reader):
+                seen = (*recording.recognitions, NO_SCAN_LINES)
+                recording = replace(recording, readings=replace(said, rings=False), recognitions=seen)
             instant, of_points = said.compensated, None
             if instant is None and sweeps:
                 instant, of_points = recording._compensated(reader)
@@ -271,6 +275,12 @@ class BagRecording:
 
     def _clouds(self) -> list[bag_index.MessageLocation]:
         return [cloud for sweep in self.streams.lidar for cloud in sweep.clouds]
+
+    def _is_unordered(self, reader: BagReader) -> bool:
+        """Whether ring numbers are no scan lines, by two sweeps: to look for the cones of each takes time."""
+        sweeps = self.streams.lidar
+        looked_at = [self._sweep(reader, sweeps[index]) for index in evenly_spread(len(sweeps), 2)]
+        return bool(looked_at) and all(NO_SCAN_LINES in sweep.recognitions for sweep in looked_at)
 
     def _compensated(self, reader: BagReader) -> tuple[str | None, Recognition | None]:
         """See `bag_recognition.compensated`, of some sweeps."""

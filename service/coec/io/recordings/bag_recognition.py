@@ -48,6 +48,9 @@ SAMPLED_MOVES, MOST_BETWEEN = 40, 64
 """Messages of an odometry whose poses and velocities are compared, evenly chosen, each with those up to the next pose,
 at most so many."""
 
+FEW_CLOUDS: Final = 5
+"""Clouds that are looked at before a doubt."""
+
 OVERLAPPING: Final = 1.3
 """Parts of one turn last no longer than so many times their distance; clouds of two LiDARs overlap in time."""
 
@@ -56,8 +59,9 @@ Value = TypeVar("Value")
 SAMPLED_SWEEPS: Final = 6
 """Sweeps that are looked at for compensation."""
 
-GAP: Final = 3.0
-"""Clouds that are parts of one turn follow each other; a gap of so many median intervals ends a turn."""
+GAP: Final = 1.8
+"""Clouds that are parts of one turn follow each other; a gap of so many median intervals, as where one was lost, ends a
+turn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,26 +194,26 @@ def sweeps_of_clouds(
     alone = [Sweep(place.stamp_ns, place.at, place.type_name, (place,)) for place in places]
     if clouds is not None:
         return (alone if clouds == 1 else _joined(places, clouds)), ()
-    seen = [load(place) for place in places[:1]]
-    if not seen or sectors(seen[0]).sum() >= WHOLE * SECTORS:
-        return alone, ()
+    seen = [load(place) for place in places[:FEW_CLOUDS]]
+    if _overlap(seen):
+        text = (
+            "The clouds of the topic overlap in time: perhaps two LiDARs publish on it, and each needs its own; "
+            "?clouds_per_sweep=1 leaves out this line."
+        )
+        return alone, (Recognition("several_lidars", text, "warn"),)
     # A LiDAR that does not turn shows the same sectors at once.
-    for count in (4, MOST_CLOUDS):
-        seen += [load(place) for place in places[len(seen) : count]]
-        in_turn = clouds_in_turn([sectors(one) for one in seen])
-        if in_turn == 1 and not _turning(seen):
-            return alone, ()
+    if not seen or sectors(seen[0]).sum() >= WHOLE * SECTORS or not _turning(seen):
+        return alone, ()
+    seen += [load(place) for place in places[len(seen) : MOST_CLOUDS]]
+    in_turn = clouds_in_turn([sectors(one) for one in seen])
     if in_turn == 1:
         return alone, ()
     degrees = 360 * float(np.median([sectors(one).sum() for one in seen])) / SECTORS
     what = f"Each cloud covers {degrees:.0f} degrees of the turn, {in_turn} in a row the whole"
-    timed = [float(np.ptp(one.time_offset_s)) for one in seen if one.time_offset_s is not None]
-    apart_s = float(np.median(np.diff([one.stamp_ns for one in seen]))) * 1e-9
-    one_after_the_other = timed and float(np.median(timed)) <= OVERLAPPING * apart_s
-    if not one_after_the_other and (timed or in_turn == 2):
+    if in_turn == 2 and seen[0].time_offset_s is None:
         text = (
-            f"{what}, but at the same time: perhaps two LiDARs publish on the topic. Record a topic for each; if the "
-            f"clouds are parts of one turn, say ?clouds_per_sweep={in_turn}, if not, ?clouds_per_sweep=1."
+            f"{what}: perhaps two LiDARs publish on the topic, and each needs its own; if the clouds are parts of one "
+            f"turn, say ?clouds_per_sweep={in_turn}, if not, ?clouds_per_sweep=1."
         )
         return alone, (Recognition("several_lidars", text, "warn"),)
     text = (
@@ -217,6 +221,15 @@ def sweeps_of_clouds(
         "cut_angle), which the service needs; ?clouds_per_sweep=1 takes each cloud as a sweep."
     )
     return _joined(places, in_turn), (Recognition("partial_clouds", text, "warn"),)
+
+
+def _overlap(clouds: Sequence[LidarFrame]) -> bool:
+    """Whether consecutive clouds were measured at the same time, as far as points have times."""
+    timed = [float(np.ptp(cloud.time_offset_s)) for cloud in clouds if cloud.time_offset_s is not None]
+    stamps_ns = sorted({cloud.stamp_ns for cloud in clouds})
+    if not timed or len(stamps_ns) < FEW_CLOUDS:
+        return False
+    return float(np.median(timed)) > OVERLAPPING * float(np.median(np.diff(stamps_ns))) * 1e-9
 
 
 def _turning(seen: Sequence[LidarFrame]) -> bool:
