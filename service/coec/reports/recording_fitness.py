@@ -30,7 +30,7 @@ from coec.geometry.cameras import in_image
 from coec.geometry.points import lengths
 from coec.geometry.projection import project
 from coec.io.recordings.recording_source import RecordingSource, evenly_spread, recognitions_of
-from coec.io.recordings.window_cutting import clocks_apart, clocks_text
+from coec.io.recordings.window_cutting import clock_separation_text, clocks_text
 
 NS_PER_S = 1e9
 
@@ -170,7 +170,7 @@ def fitness_of(recording: RecordingSource) -> Fitness:
         sync_ms=(float(np.median(sync_ms)), float(np.abs(sync_ms).max())) if len(sync_ms) else None,
         in_view=float(np.median([in_view(sweep, rig) for sweep in sweeps])) if sweeps else 0.0,
         not_finite=float(np.median([_not_finite(sweep) for sweep in sweeps])) if sweeps else 0.0,
-        clocks=(clocks_apart if pairs else clocks_text)(stamps_ns, recording.sweep_stamps_ns),
+        clocks=(clock_separation_text if pairs else clocks_text)(stamps_ns, recording.sweep_stamps_ns),
         remarks=(),
     )
     recognised = [Notice(one.level, one.code, one.text) for one in recognitions_of(recording, sweeps)]

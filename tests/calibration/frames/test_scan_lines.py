@@ -40,8 +40,8 @@ def test_the_beams_of_a_tilted_lidar_are_scan_lines() -> None:
 def test_a_few_layers_are_scan_lines(layers: int) -> None:
     sweep = turning_sweep()
     assert sweep.ring is not None
-    kept = np.isin(sweep.ring, np.arange(layers) + 6)
-    few = replace(sweep, xyz_m=sweep.xyz_m[kept], ring=sweep.ring[kept])
+    selected = np.isin(sweep.ring, np.arange(layers) + 6)
+    few = replace(sweep, xyz_m=sweep.xyz_m[selected], ring=sweep.ring[selected])
     assert read(few).ring is not None
 
 

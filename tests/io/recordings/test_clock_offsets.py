@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coec.io.recordings.window_cutting import clocks_apart, clocks_text
+from coec.io.recordings.window_cutting import clock_separation_text, clocks_text
 
 BEGIN_NS, FRAMES_NS = 1_700_000_000_000_000_000, [k * 100_000_000 for k in range(20)]
 
@@ -61,16 +61,16 @@ def streams(offset_s: float, seconds: int = 90, late_s: float = 0.0) -> tuple[li
 
 @pytest.mark.parametrize("late_s", [0.0, 3.0])
 @pytest.mark.parametrize("offset_s", [37.0, -18.0, 3600.0])
-def test_streams_that_overlap_are_apart_if_they_begin_and_end_so(offset_s: float, late_s: float) -> None:
+def test_streams_that_overlap_but_begin_and_end_at_other_times(offset_s: float, late_s: float) -> None:
     cameras, sweeps = streams(offset_s, late_s=late_s)
-    assert f"the clouds are {abs(offset_s):.3f} s" in clocks_apart(cameras, sweeps)
+    assert f"the clouds are {abs(offset_s):.3f} s" in clock_separation_text(cameras, sweeps)
 
 
 @pytest.mark.parametrize("offset_s", [0.0, 0.08, -1.4, 3.0, 25.0, 60.0])
 def test_other_streams_are_not(offset_s: float) -> None:
     cameras, sweeps = streams(offset_s)
-    assert clocks_apart(cameras, sweeps) == ""
+    assert clock_separation_text(cameras, sweeps) == ""
     # A LiDAR that is switched on later or off earlier is of the same clock.
-    assert clocks_apart(cameras, cameras[37:]) == ""
-    assert clocks_apart(cameras, cameras[:-37]) == ""
-    assert clocks_apart(cameras[:2], sweeps[:2]) == ""
+    assert clock_separation_text(cameras, cameras[37:]) == ""
+    assert clock_separation_text(cameras, cameras[:-37]) == ""
+    assert clock_separation_text(cameras[:2], sweeps[:2]) == ""

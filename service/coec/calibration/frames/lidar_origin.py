@@ -38,7 +38,7 @@ STEPS, STEP = 16, 1e-3
 LONGEST = np.array([1.0, 1.0, 1.0, 0.2, 0.2])
 """Longest step of the search: metres, and slopes of the axis."""
 
-TOLD_APART = 0.5
+DISTINCT = 0.5
 """Rings are scan lines if the elevations within a ring deviate by at most this share of their deviation over all
 points. The beams of a turning LiDAR: less than 0.1; the lasers of a rosette, or zones of azimuth: about 1. See
 docs/measured.md."""
@@ -90,12 +90,12 @@ class Rings:
         """The typical deviation, as the standard deviation of a normal distribution with the same median."""
         return NORMAL * float(np.median(np.abs(self.deviations_rad(cones))))
 
-    def are_told_apart(self, cones: Doubles) -> bool:
+    def are_distinct(self, cones: Doubles) -> bool:
         """Whether each ring has an elevation of its own there. From far enough away all points have nearly the same, so
         that thin rings alone prove nothing."""
         seen_rad = elevation_rad(self.xyz_m, cones)
         within_rad = np.abs(seen_rad - self._beams_rad(seen_rad)[self.number]).mean()
-        return bool(within_rad <= TOLD_APART * np.abs(seen_rad - np.median(seen_rad)).mean())
+        return bool(within_rad <= DISTINCT * np.abs(seen_rad - np.median(seen_rad)).mean())
 
     def sharpest(self) -> Doubles:
         """The cones (5,) from which the points deviate least: Gauss-Newton on the deviations, without those beyond
@@ -211,7 +211,7 @@ def _beginning(rings: Rings, guesses: tuple[Doubles, ...]) -> tuple[Rings, Doubl
         cones = next((guess for guess in guesses if block.spread_rad(guess) <= THIN_RAD), None)
         if cones is None:
             cones = block.sharpest()
-        if block.spread_rad(cones) <= THIN_RAD and block.are_told_apart(cones):
+        if block.spread_rad(cones) <= THIN_RAD and block.are_distinct(cones):
             return block, cones
     return None
 
@@ -352,14 +352,14 @@ class OriginCheck:
         few points tell."""
         rings = _rings(sweep, FEW_RINGS)
         return rings is None or any(
-            rings.are_told_apart(cones) for cones in (np.zeros(5), self._cones) if cones is not None
+            rings.are_distinct(cones) for cones in (np.zeros(5), self._cones) if cones is not None
         )
 
     def _one_of(self, rings: Rings, stated_rad: float) -> Doubles | None:
         """The cones of a single LiDAR, if they explain the rings."""
 
         def explain(cones: Doubles) -> bool:
-            return rings.spread_rad(cones) <= EXPLAINED * stated_rad and rings.are_told_apart(cones)
+            return rings.spread_rad(cones) <= EXPLAINED * stated_rad and rings.are_distinct(cones)
 
         if self._cones is None or not explain(self._cones):
             cones = rings.sharpest()

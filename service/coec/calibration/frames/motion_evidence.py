@@ -101,7 +101,7 @@ def motions_of_poses(messages: Sequence[PoseAndTwist]) -> tuple[EgoMotion, ...]:
 def _intervals(messages: Sequence[PoseAndTwist]) -> list[tuple[int, int]]:
     """For each message with a pose the first one with a pose that is at least `LEAST_S` later, if it is near enough."""
     posed = [index for index, message in enumerate(messages) if message.T_parent_child is not None]
-    found, later = [], 0
+    intervals, later = [], 0
     for place, first in enumerate(posed):
         later = max(later, place + 1)
         while later < len(posed) and messages[posed[later]].stamp_ns - messages[first].stamp_ns < LEAST_S * 1e9:
@@ -109,8 +109,8 @@ def _intervals(messages: Sequence[PoseAndTwist]) -> list[tuple[int, int]]:
         if later == len(posed):
             break
         if messages[posed[later]].stamp_ns - messages[first].stamp_ns <= MOST_S * 1e9:
-            found.append((first, posed[later]))
-    return found
+            intervals.append((first, posed[later]))
+    return intervals
 
 
 def _compared(messages: Sequence[PoseAndTwist]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

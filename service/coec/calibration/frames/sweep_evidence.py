@@ -62,12 +62,12 @@ def instants_s(sweep: LidarFrame) -> dict[str, float]:
 def _vote(sweep: LidarFrame, motion: EgoMotion, T_lidar_ego: Matrix4) -> str | None:
     """The instant for which the points of one sweep were compensated; None: for none."""
     range_m = lengths(sweep.xyz_m)
-    chosen = np.flatnonzero((range_m > NEAR_M) & (range_m < FAR_M))
-    chosen = chosen[:: max(1, len(chosen) // POINTS)]
+    selected = np.flatnonzero((range_m > NEAR_M) & (range_m < FAR_M))
+    selected = selected[:: max(1, len(selected) // POINTS)]
     assert sweep.time_offset_s is not None
-    times_s = sweep.time_offset_s[chosen].astype(np.float64)
-    xyz_m = np.ascontiguousarray(sweep.xyz_m[chosen])
-    beam = np.zeros(len(chosen), np.uint16) if sweep.ring is None else sweep.ring[chosen]
+    times_s = sweep.time_offset_s[selected].astype(np.float64)
+    xyz_m = np.ascontiguousarray(sweep.xyz_m[selected])
+    beam = np.zeros(len(selected), np.uint16) if sweep.ring is None else sweep.ring[selected]
     angular_radps, linear_mps = sensor_twist(motion, T_lidar_ego)
     as_given = _unevenness_rad(xyz_m, times_s, beam)
     undone = {
@@ -90,8 +90,8 @@ def _unevenness_rad(xyz_m: NDArray[np.float32], times_s: NDArray[np.float64], be
         if len(angle) < MIN_POINTS or at_s[-1] - at_s[0] < LEAST_SWEEP_S:
             continue
         angle = np.unwrap(angle)
-        apart_s = np.maximum(at_s[half : 2 * half] - at_s[:half], 1e-6)
-        rate = np.median((angle[half : 2 * half] - angle[:half]) / apart_s)
+        between_s = np.maximum(at_s[half : 2 * half] - at_s[:half], 1e-6)
+        rate = np.median((angle[half : 2 * half] - angle[:half]) / between_s)
         from_line = angle - rate * at_s
         deviations.append(np.abs(from_line - np.median(from_line)))
     return float(np.median(np.concatenate(deviations))) if deviations else float("inf")

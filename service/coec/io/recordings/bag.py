@@ -255,19 +255,19 @@ class BagRecording:
         Raises:
             SourceError: a cloud cannot be read.
         """
-        said = self.readings
+        readings = self.readings
         with self.storage.open() as reader:
 
             def load(place: bag_index.MessageLocation) -> LidarFrame:
                 return self._cloud(reader, place)
 
-            sweeps, of_clouds = bag_recognition.sweeps_of_clouds(self._clouds(), load, said.clouds)
-            streams = _shifted(replace(self.streams, lidar=sweeps), said)
+            sweeps, of_clouds = bag_recognition.sweeps_of_clouds(self._clouds(), load, readings.clouds)
+            streams = _shifted(replace(self.streams, lidar=sweeps), readings)
             recording = replace(self, streams=streams, recognitions=(*self.recognitions, *of_clouds))
-            if said.rings is None and recording._is_unordered(reader):
+            if readings.rings is None and recording._is_unordered(reader):
                 seen = (*recording.recognitions, NO_SCAN_LINES)
-                recording = replace(recording, readings=replace(said, rings=False), recognitions=seen)
-            instant, of_points = said.compensated, None
+                recording = replace(recording, readings=replace(readings, rings=False), recognitions=seen)
+            instant, of_points = readings.compensated, None
             if instant is None and sweeps:
                 instant, of_points = recording._compensated(reader)
         recognitions = (*recording.recognitions, *(() if of_points is None else (of_points,)))
@@ -279,14 +279,14 @@ class BagRecording:
     def _is_unordered(self, reader: BagReader) -> bool:
         """Whether ring numbers are no scan lines, by two sweeps: to look for the cones of each takes time."""
         sweeps = self.streams.lidar
-        looked_at = [self._sweep(reader, sweeps[index]) for index in evenly_spread(len(sweeps), 2)]
-        return bool(looked_at) and all(NO_SCAN_LINES in sweep.recognitions for sweep in looked_at)
+        inspected = [self._sweep(reader, sweeps[index]) for index in evenly_spread(len(sweeps), 2)]
+        return bool(inspected) and all(NO_SCAN_LINES in sweep.recognitions for sweep in inspected)
 
     def _compensated(self, reader: BagReader) -> tuple[str | None, Recognition | None]:
         """See `bag_recognition.compensated`, of some sweeps."""
         sweeps = self.streams.lidar
-        chosen = [sweeps[index] for index in evenly_spread(len(sweeps), bag_recognition.SAMPLED_SWEEPS)]
-        stamps_ns = [sweep.stamp_ns for sweep in chosen]
+        sampled = [sweeps[index] for index in evenly_spread(len(sweeps), bag_recognition.SAMPLED_SWEEPS)]
+        stamps_ns = [sweep.stamp_ns for sweep in sampled]
         motions = [
             motion if isinstance(motion, EgoMotion) else _load(self.storage, reader, motion, self.clouds)
             for motion in self.streams.motions
@@ -295,7 +295,8 @@ class BagRecording:
         known = [motion for motion in motions if isinstance(motion, EgoMotion)]
         if not known:
             return None, None
-        return bag_recognition.compensated((self._sweep(reader, one) for one in chosen), known, self.rig.T_lidar_ego)
+        loaded = (self._sweep(reader, sweep) for sweep in sampled)
+        return bag_recognition.compensated(loaded, known, self.rig.T_lidar_ego)
 
     def _cloud(self, reader: BagReader, place: bag_index.MessageLocation) -> LidarFrame:
         cloud = _load(self.storage, reader, place, self.clouds)
@@ -320,12 +321,12 @@ class BagRecording:
         )
 
 
-def _shifted(streams: PairStreams, said: bag_recognition.Readings) -> PairStreams:
+def _shifted(streams: PairStreams, readings: bag_recognition.Readings) -> PairStreams:
     """The streams with their stamps corrected."""
     return replace(
         streams,
-        camera=[replace(place, stamp_ns=place.stamp_ns + said.camera_offset_ns) for place in streams.camera],
-        lidar=[replace(place, stamp_ns=place.stamp_ns + said.lidar_offset_ns) for place in streams.lidar],
+        camera=[replace(place, stamp_ns=place.stamp_ns + readings.camera_offset_ns) for place in streams.camera],
+        lidar=[replace(place, stamp_ns=place.stamp_ns + readings.lidar_offset_ns) for place in streams.lidar],
     )
 
 
@@ -335,7 +336,7 @@ def _streams(
     camera: str,
     lidar: str,
     motion: tuple[tuple[str, str], str | None],
-    said: bag_recognition.Readings,
+    readings: bag_recognition.Readings,
 ) -> tuple[PairStreams, Recognition | None]:
     """The streams of the pair, each cloud a sweep, and what to tell of the motion. `motion`: the vehicle's frames, and
     the topic that was asked for."""
@@ -351,7 +352,7 @@ def _streams(
         _require_stamps(index, topic)
     of_twists = None
     if places and places[0].type_name == messages.ODOMETRY:
-        by_poses, of_twists = bag_recognition.motion_of_odometry(reader, places, said.motion)
+        by_poses, of_twists = bag_recognition.motion_of_odometry(reader, places, readings.motion)
         places, moved = (places, moved) if by_poses is None else ([], by_poses)
     sweeps = [Sweep(place.stamp_ns, place.at, place.type_name, (place,)) for place in index.streams[lidar].ordered()]
     return PairStreams(index.streams[camera].ordered(), sweeps, places, moved), of_twists

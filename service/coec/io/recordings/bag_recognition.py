@@ -44,9 +44,9 @@ from coec.io.ros.transforms import odometry_pose
 MAX_OFFSET_S: Final = 1e10
 """Largest correction of stamps, s: from nanoseconds since 1970 that were read as seconds nothing can be corrected."""
 
-SAMPLED_MOVES, MOST_BETWEEN = 40, 64
-"""Messages of an odometry whose poses and velocities are compared, evenly chosen, each with those up to the next pose,
-at most so many."""
+SAMPLED_MOVES, MOST_BETWEEN = 40, 256
+"""Messages of an odometry whose poses and velocities are compared, evenly selected, and the most that follow each up to
+the next pose that is far enough from it."""
 
 FEW_CLOUDS: Final = 5
 """Clouds that are looked at before a doubt."""
@@ -91,10 +91,10 @@ class Readings:
             UsageError: a value does not fit.
         """
         return cls(
-            _chosen(query, "rings", {"lines": True, "none": False}),
-            _chosen(query, "compensated", {"no": "", **{name: name for name in ("stamp", "begin", "middle", "end")}}),
-            _chosen(query, "clouds_per_sweep", {str(count): count for count in range(1, MOST_CLOUDS + 1)}),
-            _chosen(query, "motion", {"twist": "twist", "pose": "pose"}),
+            _value(query, "rings", {"lines": True, "none": False}),
+            _value(query, "compensated", {"no": "", **{name: name for name in ("stamp", "begin", "middle", "end")}}),
+            _value(query, "clouds_per_sweep", {str(count): count for count in range(1, MOST_CLOUDS + 1)}),
+            _value(query, "motion", {"twist": "twist", "pose": "pose"}),
             _offset_ns(query, "camera_offset"),
             _offset_ns(query, "lidar_offset"),
         )
@@ -104,7 +104,7 @@ READING_KEYS: Final = ("rings", "compensated", "clouds_per_sweep", "motion", "ca
 """The keys that `Readings` reads."""
 
 
-def _chosen(query: dict[str, str], key: str, values: dict[str, Value]) -> Value | None:
+def _value(query: dict[str, str], key: str, values: dict[str, Value]) -> Value | None:
     if key not in query:
         return None
     if query[key] not in values:
@@ -156,13 +156,13 @@ def motion_of_odometry(
 
 def _near_each_other(places: Sequence[MessageLocation]) -> list[int]:
     """Indices of some messages, and of those that follow each until poses are far enough apart."""
-    chosen: set[int] = set()
+    selected: set[int] = set()
     for start in evenly_spread(len(places), SAMPLED_MOVES):
         for index in range(start, min(start + MOST_BETWEEN, len(places))):
-            chosen.add(index)
+            selected.add(index)
             if places[index].stamp_ns - places[start].stamp_ns >= LEAST_S * 1e9:
                 break
-    return sorted(chosen)
+    return sorted(selected)
 
 
 def _posed(reader: BagReader, place: MessageLocation) -> PoseAndTwist:

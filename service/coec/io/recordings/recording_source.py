@@ -191,7 +191,9 @@ FORMS = """accepted forms of a source:
   BAG?camera=/TOPIC&points=/TOPIC&...           any ROS 2 bag: FILE.mcap, FILE.db3 or rosbag2's folder (topics are found
                                                 by type where they are unique; lidar_frame=NAME for clouds in another,
                                                 moving=PARENT,CHILD for motion on /tf, time=FIELD,UNIT[,BASE],
-                                                lidar_source=N for one LiDAR of a cloud of several)
+                                                lidar_source=N for one LiDAR of a cloud of several; rings=,
+                                                compensated=, clouds_per_sweep=, motion=, odometry_frame=,
+                                                camera_offset=, lidar_offset= where `coec check` names them)
   kitti360:ROOT?drive=...&camera=image_00       KITTI-360 in its official folders
   kitti-raw:ROOT?drive=...&camera=image_02      KITTI raw in its official folders, or one drive with its calib_*.txt
   FOLDER or dataset.yaml                        images and clouds listed in a manifest

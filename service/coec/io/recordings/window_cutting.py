@@ -112,9 +112,9 @@ def window_of_recording(
     window = Window(window_id, recording.rig, recording.T_camera_lidar_start, tuple(pairs), MOUNT_RAD)
     losses = {cause: count for cause, count in pairer.losses.items() if count}
     recognised = recognitions_of(recording, (pair.lidar for pair in pairs))
-    apart = clocks_apart(recording.camera_stamps_ns, recording.sweep_stamps_ns)
-    if apart:
-        recognised = (Recognition("clocks_apart", f"Frames find the wrong sweeps: {apart}.", "fail"), *recognised)
+    separate = clock_separation_text(recording.camera_stamps_ns, recording.sweep_stamps_ns)
+    if separate:
+        recognised = (Recognition("clocks_apart", f"Frames find the wrong sweeps: {separate}.", "fail"), *recognised)
     return LoadedWindow(window, recording.configuration, _default_vehicle(), losses, recognised)
 
 
@@ -130,7 +130,7 @@ def clocks_text(camera_stamps_ns: Sequence[int], sweep_stamps_ns: Sequence[int])
     return _offset_text(offset_s, float(cameras[0]), float(sweeps[0]))
 
 
-def clocks_apart(camera_stamps_ns: Sequence[int], sweep_stamps_ns: Sequence[int]) -> str:
+def clock_separation_text(camera_stamps_ns: Sequence[int], sweep_stamps_ns: Sequence[int]) -> str:
     """As `clocks_text`, if the clouds begin and end one known difference of clocks before or after the images, so that
     frames that find a sweep find a wrong one; empty otherwise."""
     if min(len(camera_stamps_ns), len(sweep_stamps_ns)) < FEWEST_STAMPS:
@@ -140,10 +140,11 @@ def clocks_apart(camera_stamps_ns: Sequence[int], sweep_stamps_ns: Sequence[int]
     # A recorder ends all streams at once; sensors may take a while to start.
     within_s = 0.5 + max(float(np.median(np.diff(stamps_s))) for stamps_s in (cameras, sweeps))
     known_s = (*TIME_SCALES_S, *(3600.0 * hours for hours in range(1, 15)))
-    apart_s = min((sign * gap_s for gap_s in known_s for sign in (-1.0, 1.0)), key=lambda gap_s: abs(end_s - gap_s))
-    if abs(end_s - apart_s) > within_s or abs(begin_s - apart_s) > within_s + STARTING_S:
+    signed_s = (sign * gap_s for gap_s in known_s for sign in (-1.0, 1.0))
+    separation_s = min(signed_s, key=lambda gap_s: abs(end_s - gap_s))
+    if abs(end_s - separation_s) > within_s or abs(begin_s - separation_s) > within_s + STARTING_S:
         return ""
-    return _offset_text(apart_s, float(cameras[0]), float(sweeps[0]))
+    return _offset_text(separation_s, float(cameras[0]), float(sweeps[0]))
 
 
 def _offset_text(offset_s: float, camera_s: float, sweep_s: float) -> str:
