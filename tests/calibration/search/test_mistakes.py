@@ -181,7 +181,7 @@ def test_clouds_that_are_stamped_a_sweep_late_are_named(street: Window) -> None:
     mistake = named(replace(street, pairs=late))
     assert mistake is not None
     assert mistake.code == mistakes.CLOCK_OFFSET
-    assert mistake.text.endswith("(the clouds -0.100 s)")
+    assert mistake.text.endswith("(the clouds -0.100 s; of a bag, ?lidar_offset=-0.100)")
 
 
 def test_images_of_another_size_are_named_without_a_search(street: Window) -> None:

@@ -207,6 +207,22 @@ def test_times_that_may_mean_two_things_are_counted_and_the_log_says_what_to_do(
     assert reported.losses.snapshot() == {(LIDAR, "cloud_fields"): 1}
 
 
+def test_ring_numbers_that_are_no_scan_lines_are_left_out_and_the_log_says_so_once(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    sweep = turning_sweep()
+    columns = [(axis, "<f4", sweep.xyz_m[:2000, index].tolist()) for index, axis in enumerate("xyz")]
+    for _ in range(2):
+        frame = bench.take(LIDAR, packed_cloud([*columns, ("line", "u1", [k % 6 for k in range(2000)])]), CDR)
+        assert isinstance(frame, LidarFrame)
+        assert frame.ring is None
+    assert caplog.text.count("are no scan lines") == 1
+    assert sweep.ring is not None
+    frame = Bench().take(LIDAR, packed_cloud([*columns, ("ring", "<u2", sweep.ring[:2000].tolist())]), CDR)
+    assert isinstance(frame, LidarFrame)
+    assert frame.ring is not None
+
+
 def test_a_type_that_people_take_for_the_right_one_is_distinguished(
     bench: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
