@@ -11,7 +11,7 @@ z forward). Stamps are sensor time in integer nanoseconds.
 from __future__ import annotations
 
 from collections.abc import Generator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import pi, radians
 from typing import Literal, Protocol, TypeVar
@@ -162,6 +162,12 @@ class EgoMotion:
         """Magnitude of the angular velocity in radians per second."""
         x, y, z = self.angular_radps
         return float(np.sqrt(x * x + y * y + z * z))
+
+    def backwards(self) -> EgoMotion:
+        """The opposite motion."""
+        x, y, z = self.angular_radps
+        linear = None if self.linear_mps is None else (-self.linear_mps[0], -self.linear_mps[1], -self.linear_mps[2])
+        return replace(self, linear_mps=linear, angular_radps=(-x, -y, -z))
 
     def reaches(self, speed_mps: float) -> bool:
         """Whether the vehicle is known to be at least so fast."""

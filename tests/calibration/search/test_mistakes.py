@@ -174,6 +174,15 @@ def test_clouds_that_are_compensated_already_are_named(street: Window) -> None:
     assert (mistake.code, mistake.correctable) == (mistakes.COMPENSATED, False)
 
 
+def test_motion_that_is_given_backwards_is_named(street: Window) -> None:
+    reversed_pairs = tuple(
+        replace(pair, motion=None if pair.motion is None else pair.motion.backwards()) for pair in street.pairs
+    )
+    mistake = named(replace(street, pairs=reversed_pairs))
+    assert mistake is not None
+    assert (mistake.code, mistake.correctable) == (mistakes.BACKWARDS, False)
+
+
 def test_clouds_that_are_stamped_a_sweep_late_are_named(street: Window) -> None:
     late = tuple(
         replace(pair, lidar=replace(pair.lidar, stamp_ns=pair.lidar.stamp_ns + 100_000_000)) for pair in street.pairs

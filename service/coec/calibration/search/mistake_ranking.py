@@ -23,6 +23,7 @@ from coec.calibration.objective.edges import COARSEST_BLUR_RAD
 from coec.calibration.search.mistakes import (
     AS_GIVEN,
     AS_GIVEN_ODDS,
+    BACKWARDS,
     CLOCK_OFFSET,
     COMPENSATED,
     IMAGE_SCALE,
@@ -189,20 +190,21 @@ def _named(best: Ranked, given: Ranked) -> Mistake:
         given.significance,
         supposition.camera,
         supposition.T_camera_lidar,
-        correctable=not supposition.mirrored and supposition.code not in (COMPENSATED, CLOCK_OFFSET),
+        correctable=not supposition.mirrored and supposition.code not in (BACKWARDS, COMPENSATED, CLOCK_OFFSET),
     )
 
 
 def _other_time(data: WindowData, edges: Edges, given: Ranked) -> tuple[float, Ranked | None]:
-    """The clouds as they are, if a driver has compensated them for motion, or some seconds later: which fits best, and
-    by how many seconds it is later. None if none is more probable than the inputs as given by `LEAST_ODDS`, for
-    vehicles that hardly move, and where no times are known."""
+    """The clouds as they are, if a driver has compensated them for motion, or for the opposite motion, or some seconds
+    later: which fits best, and by how many seconds it is later. None if none is more probable than the inputs as given
+    by `LEAST_ODDS`, for vehicles that hardly move, and where no times are known."""
     part = _some_pairs(data)
     sweep_s = _sweep_duration_s(part)
     moving = any(pair.motion is not None and pair.motion.reaches(LEAST_SPEED_MPS) for pair in part.window.pairs)
     if not (data.compensated and moving and sweep_s > 0.0 and len(part.window.pairs) >= LEAST_TIMED):
         return 0.0, None
     trials = [(AS_GIVEN, 0.0, part), (COMPENSATED, 0.0, replace(part, compensated=False))]
+    trials.append((BACKWARDS, 0.0, _backwards(part)))
     trials += [(CLOCK_OFFSET, share * sweep_s, _later(part, share * sweep_s)) for share in LATER]
     ends = []
     for code, late_s, other in trials:
@@ -224,6 +226,14 @@ def _sweep_duration_s(data: WindowData) -> float:
     if times_s is not None and len(times_s):
         return float(times_s.max() - times_s.min())
     return 0.0 if sweep is None else sweep.period_s
+
+
+def _backwards(data: WindowData) -> WindowData:
+    """The window with all motion reversed."""
+    pairs = (
+        pair if pair.motion is None else replace(pair, motion=pair.motion.backwards()) for pair in data.window.pairs
+    )
+    return replace(data, window=replace(data.window, pairs=tuple(pairs)))
 
 
 def _later(data: WindowData, late_s: float) -> WindowData:

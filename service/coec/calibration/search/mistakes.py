@@ -38,7 +38,7 @@ QUATERNION_ORDER, CAMERA_AXES, INVERSE_AND_AXES = "quaternion_order", "camera_ax
 LIDAR_AXES, POSE_UNIT, CLOUD_FRAME = "lidar_axes", "pose_unit", "cloud_frame"
 FOCAL_LENGTH, IMAGE_SCALE, PRINCIPAL_POINT = "focal_length", "image_scale", "principal_point"
 FOCAL_LENGTHS_SWAPPED, CENTRE_SWAPPED, RECTIFIED = "focal_lengths_swapped", "centre_swapped", "rectified_image"
-COMPENSATED, CLOCK_OFFSET = "already_compensated", "clock_offset"
+COMPENSATED, CLOCK_OFFSET, BACKWARDS = "already_compensated", "clock_offset", "motion_backwards"
 TURNED_180, TURNED_90, MIRRORED = "image_turned_180", "image_turned_90", "image_mirrored"
 
 KINDS: Mapping[str, Kind] = MappingProxyType(
@@ -126,6 +126,12 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
             0.1,
             "the clouds as they are",
             "the clouds are probably motion-compensated already: run with --no-motion-compensation, or without twist",
+        ),
+        BACKWARDS: Kind(
+            0.05,
+            "the motion backwards",
+            "the velocities of the vehicle are probably given backwards, or in a frame that looks backwards: correct "
+            "their sign, or the pose of their frame",
         ),
         CLOCK_OFFSET: Kind(
             0.3,

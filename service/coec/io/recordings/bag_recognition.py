@@ -224,7 +224,10 @@ def sweeps_of_clouds(
 
 
 def _overlap(clouds: Sequence[LidarFrame]) -> bool:
-    """Whether consecutive clouds were measured at the same time, as far as points have times."""
+    """Whether consecutive clouds were measured at the same time: with one stamp, and not twice the same, or as far as
+    points have times."""
+    if any(a.stamp_ns == b.stamp_ns and not np.array_equal(a.xyz_m, b.xyz_m) for a, b in pairwise(clouds)):
+        return True
     timed = [float(np.ptp(cloud.time_offset_s)) for cloud in clouds if cloud.time_offset_s is not None]
     stamps_ns = sorted({cloud.stamp_ns for cloud in clouds})
     if not timed or len(stamps_ns) < FEW_CLOUDS:
