@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from coec.io.recordings.layouts import open_source
 from coec.io.recordings.window_cutting import clock_separation_text, clocks_text
 
 BEGIN_NS, FRAMES_NS = 1_700_000_000_000_000_000, [k * 100_000_000 for k in range(20)]
@@ -74,3 +77,14 @@ def test_other_streams_are_not(offset_s: float) -> None:
     assert clock_separation_text(cameras, cameras[37:]) == ""
     assert clock_separation_text(cameras, cameras[:-37]) == ""
     assert clock_separation_text(cameras[:2], sweeps[:2]) == ""
+
+
+def test_sparse_streams_do_not_show_when_they_begin() -> None:
+    sparse = [BEGIN_NS + k * 60_000_000_000 for k in range(10)]
+    assert clock_separation_text(sparse, [stamp + 20_000_000 for stamp in sparse]) == ""
+
+
+@pytest.mark.parametrize("folder", ["tamu_right_os", "tamu_right_vlp", "fisheye_lab_vlp16", "yoco_fisheye_bpearl"])
+def test_real_streams_are_of_one_clock(folder: str, sample_data: Path) -> None:
+    recording = open_source(str(sample_data / folder))
+    assert clock_separation_text(recording.camera_stamps_ns, recording.sweep_stamps_ns) == ""

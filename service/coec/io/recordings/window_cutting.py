@@ -138,7 +138,10 @@ def clock_separation_text(camera_stamps_ns: Sequence[int], sweep_stamps_ns: Sequ
     cameras, sweeps = (np.array(stamps, dtype=np.float64) * 1e-9 for stamps in (camera_stamps_ns, sweep_stamps_ns))
     begin_s, end_s = float(sweeps[0] - cameras[0]), float(sweeps[-1] - cameras[-1])
     # A recorder ends all streams at once; sensors may take a while to start.
-    within_s = 0.5 + max(float(np.median(np.diff(stamps_s))) for stamps_s in (cameras, sweeps))
+    period_s = max(float(np.median(np.diff(stamps_s))) for stamps_s in (cameras, sweeps))
+    if period_s > LONGEST_PERIOD_S:
+        return ""
+    within_s = 0.5 + period_s
     known_s = (*TIME_SCALES_S, *(3600.0 * hours for hours in range(1, 15)))
     signed_s = (sign * gap_s for gap_s in known_s for sign in (-1.0, 1.0))
     separation_s = min(signed_s, key=lambda gap_s: abs(end_s - gap_s))
@@ -179,6 +182,9 @@ START_S = 1.0
 
 STARTING_S = 5.0
 """A sensor may take so much longer than another to start."""
+
+LONGEST_PERIOD_S = 2.5
+"""Streams that are sparser, as of a selection of frames, do not show when they begin and end."""
 
 FEWEST_STAMPS = 3
 """Fewer frames of a stream show no begin and no end."""
