@@ -186,6 +186,18 @@ def test_velocities_that_poses_contradict(tmp_path: Path, stated_mps: float, cod
     assert motions(by_poses)[0].linear_mps == pytest.approx((SPEED_MPS, 0.0, 0.0), abs=1e-6)
 
 
+def test_poses_that_jump_or_are_invalid_are_no_motion(tmp_path: Path) -> None:
+    messages = odometry(0.0, poses=True)
+    messages[40][1].pose.pose.position = ros.geometry_msgs__msg__Point(1e8, float("nan"), 0.0)
+    messages[60][1].pose.pose.position = ros.geometry_msgs__msg__Point(1e8, 0.0, 0.0)
+    messages[80][1].pose.pose.orientation = ros.geometry_msgs__msg__Quaternion(0.0, 0.0, 0.0, 0.0)
+    recording = opened(tmp_path, [*ELSE, *messages, *turns()])
+    assert codes(recording) == ["twist_from_poses"]
+    assert len(recording.motion_stamps_ns) > 80
+    for one in motions(recording):
+        assert one.linear_mps == pytest.approx((SPEED_MPS, 0.0, 0.0), abs=1e-6)
+
+
 @pytest.mark.parametrize("frame_id", ["ego", ""])
 def test_motion_of_a_frame_that_is_not_in_the_tree_is_left_out(tmp_path: Path, frame_id: str) -> None:
     bag = [*ELSE, *odometry(frame_id=frame_id), *turns()]

@@ -35,6 +35,7 @@ from coec.calibration.frames.sweep_evidence import (
 )
 from coec.calibration.types import EgoMotion, LidarFrame, Matrix4, Recognition
 from coec.errors import DecodeError, SourceError, UsageError
+from coec.io.frame_validation import MAX_SPEED
 from coec.io.recordings.bag_index import MessageLocation
 from coec.io.recordings.bag_storage import BagReader
 from coec.io.recordings.recording_source import MOTION_REACH_NS, evenly_spread
@@ -136,7 +137,7 @@ def motion_of_odometry(
     if motion == "twist":
         return None, None
     if motion == "pose":
-        return motions_of_poses([_posed(reader, place) for place in places]), None
+        return _by_poses(reader, places), None
     sampled = [_posed(reader, places[index]) for index in _near_each_other(places)]
     reading = reading_of_twists(sampled)
     if reading is TwistReading.AS_STATED:
@@ -151,7 +152,15 @@ def motion_of_odometry(
         f"The velocities of the odometry are {reading}, by its poses: the motion is taken from the differences of the "
         "poses. If the velocities are right, say ?motion=twist."
     )
-    return motions_of_poses([_posed(reader, place) for place in places]), Recognition("twist_from_poses", text)
+    return _by_poses(reader, places), Recognition("twist_from_poses", text)
+
+
+def _by_poses(reader: BagReader, places: Sequence[MessageLocation]) -> tuple[EgoMotion, ...]:
+    """The motion by the poses, without jumps that no vehicle makes."""
+    motions = motions_of_poses([_posed(reader, place) for place in places])
+    return tuple(
+        motion for motion in motions if max(map(abs, (*(motion.linear_mps or ()), *motion.angular_radps))) <= MAX_SPEED
+    )
 
 
 def _near_each_other(places: Sequence[MessageLocation]) -> list[int]:
