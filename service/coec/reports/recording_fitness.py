@@ -46,6 +46,9 @@ SOME_NOT_FINITE = 0.01
 SMEARING_MPS = 1.0
 """Above this speed an uncompensated sweep of 0.1 s smears near objects by more than the spacing of its beams."""
 
+MOSTLY = 0.5
+"""Below this share of pairs with ego-motion there is a remark."""
+
 MANY_GAPS = 3.0
 """A gap between frames is long from this many median intervals on."""
 
@@ -88,6 +91,7 @@ class Fitness:
         point_time: whether points carry their own time, or the rig knows the sweep's.
         timed_by: how the times of points were read, in a line; empty where there is no doubt.
         speed_mps, turn_degps: (median, most) of the vehicle; None where the ego-motion does not tell.
+        with_motion: share of the pairs whose ego-motion is known; 0 without pairs.
         standing: share of the pairs that were taken while the vehicle stood; None where the speed is unknown.
         paired: share of the frames looked at that found a sweep.
         sync_ms: (median, most) of camera stamp minus sweep stamp, milliseconds.
@@ -112,6 +116,7 @@ class Fitness:
     timed_by: str
     speed_mps: tuple[float, float] | None
     turn_degps: tuple[float, float] | None
+    with_motion: float
     standing: float | None
     paired: float
     sync_ms: tuple[float, float] | None
@@ -165,6 +170,7 @@ def fitness_of(recording: RecordingSource) -> Fitness:
         timed_by=next((sweep.timed_by for sweep in sweeps), ""),
         speed_mps=_spread(_known(motion.speed_mps for motion in motions)),
         turn_degps=_spread([float(np.degrees(np.linalg.norm(motion.angular_radps))) for motion in motions]),
+        with_motion=float(np.mean([pair.motion is not None for pair in pairs])) if pairs else 0.0,
         standing=standing,
         paired=len(pairs) / len(sampled) if sampled else 0.0,
         sync_ms=(float(np.median(sync_ms)), float(np.abs(sync_ms).max())) if len(sync_ms) else None,
@@ -315,6 +321,13 @@ def _finite(seen: Fitness) -> Notice | None:
 def _motion(seen: Fitness) -> Notice | None:
     if seen.motion is None:
         return Notice("warn", "no_ego_motion", "No ego-motion: sweeps taken while driving cannot be compensated.")
+    if seen.paired > 0.0 and seen.with_motion < MOSTLY:
+        text = (
+            f"{1 - seen.with_motion:.0%} of the pairs have no ego-motion within "
+            f"{1e3 * PairingConfig().motion_tolerance_s:.0f} ms, so that they cannot be compensated: the stamps of the "
+            "motion must be of the clock of the images, and go on without gaps."
+        )
+        return Notice("warn", "motion_apart", text)
     if seen.speed_mps is None:
         text = "Ego-motion is rotation only: sweeps are turned back, not shifted; drive slowly, or add an odometry."
         return Notice("warn", "rotation_only", text)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -20,7 +22,7 @@ TWIST = np.array([0.0, 0.01, 0.25, 7.0, 0.3, 0.0])
 MS = 1_000_000
 
 
-READINGS = tuple(TwistReading)
+READINGS = tuple(reading for reading in TwistReading if reading not in (TwistReading.DEGREES, TwistReading.NO_TURN))
 
 
 def stated(reading: TwistReading, pose: Matrix4, velocity_mps: Vector) -> Vector:
@@ -59,6 +61,23 @@ def drive(
 @pytest.mark.parametrize("reading", READINGS)
 def test_what_was_written_is_recognised(reading: TwistReading, period_ms: int, noise_m: float) -> None:
     assert reading_of_twists(drive(reading, period_ms, noise_m)) is reading
+
+
+@pytest.mark.parametrize(
+    ("factor", "reading"),
+    [
+        (57.3, TwistReading.DEGREES),
+        (0.0, TwistReading.NO_TURN),
+        (1.1, TwistReading.AS_STATED),
+        (0.5, TwistReading.AS_STATED),
+    ],
+)
+def test_turn_rates_are_recognised_where_velocities_are_right(factor: float, reading: TwistReading) -> None:
+    turned = [
+        PoseAndTwist(one.T_parent_child, replace(one.motion, angular_radps=(0.0, 0.0, 0.25 * factor)))
+        for one in drive()
+    ]
+    assert reading_of_twists(turned) is reading
 
 
 @pytest.mark.parametrize("wrong", [0.9, 1.1])

@@ -296,6 +296,16 @@ def test_a_counter_is_named_and_not_read(name: str) -> None:
     assert f"?time={name},us,stamp" in doubt.text
 
 
+def test_a_fraction_of_a_second_is_no_time_since_the_stamp() -> None:
+    fields = {
+        "time_sec": ("<u4", [float(STAMP_S)] * COUNT),
+        "time_nsec": ("<u4", (STAMP_REST_NS + RISING_S * 1e9).tolist()),
+    }
+    frame = sweep(cloud_of_drivers(fields))
+
+    assert (frame.time_offset_s, codes(frame)) == (None, ["perhaps_a_time"])
+
+
 def test_what_does_not_rise_is_no_time() -> None:
     values = np.random.default_rng(0).uniform(0.0, 0.1, COUNT).tolist()
     frame = sweep(cloud_of_drivers({"some_time": ("<f4", values), "range": ("<f4", values)}))

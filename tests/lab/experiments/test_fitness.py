@@ -151,3 +151,10 @@ def test_points_at_the_border_of_the_image_are_in_view() -> None:
     sweep = LidarFrame(0, "lidar", at.astype(np.float32))
     assert in_view(sweep, RIG) == 1.0
     assert in_view(replace(sweep, xyz_m=(at + np.array([[0.0, 0.2, 0.0]])).astype(np.float32)), RIG) == 0.0
+
+
+def test_motion_of_another_clock_is_reported() -> None:
+    recording = a_recording()
+    later = tuple(replace(motion, stamp_ns=motion.stamp_ns + 37_000 * MS) for motion in recording.motions)
+    assert codes(replace(recording, motions=later))["motion_apart"] == "warn"
+    assert "motion_apart" not in codes(recording)

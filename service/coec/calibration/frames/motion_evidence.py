@@ -7,7 +7,7 @@ apart, the velocity in the child frame is log(T₁⁻¹·T₂)/dt, at the middle
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -21,8 +21,9 @@ LEAST_S, MOST_S = 0.1, 0.5
 """Time between the two poses of a difference: over less, the millimetres of a filter are velocities; over more, the
 velocity changes unnoticed."""
 
-MOVING_MPS, STANDING_MPS = 0.5, 0.05
-"""Speeds, by the poses or by the velocities, from which on a vehicle moves, and below which it stands."""
+MOVING_MPS, TURNING_RADPS, STANDING = 0.5, 0.05, 0.1
+"""From this speed and turn rate on, by the poses, a vehicle moves; what is stated is not filled in if it is at most
+this share of that."""
 
 LEAST_MOVES = 5
 """Fewer differences while the vehicle moves show nothing."""
@@ -40,6 +41,8 @@ class TwistReading(StrEnum):
     PARENT_FRAME = "in the parent frame, not in the child frame"
     BACKWARDS = "backwards"
     KM_PER_H = "in km/h"
+    DEGREES = "given with turn rates in degrees"
+    NO_TURN = "without turn rates"
     CONTRADICTED = "contradicted by the poses"
 
 
@@ -57,31 +60,48 @@ class PoseAndTwist:
 
 
 def reading_of_twists(messages: Sequence[PoseAndTwist]) -> TwistReading:
-    """How velocities are meant. `messages` are in the order of their stamps, and may have gaps. `AS_STATED` also where
-    nothing can be told: poses that are not filled in, a vehicle that stands."""
+    """How velocities are meant, or turn rates where the velocities are as stated. `messages` are in the order of their
+    stamps, and may have gaps. `AS_STATED` also where nothing can be told: poses that are not filled in, a vehicle that
+    stands."""
     moved, stated, turned = _compared(messages)
-    speed_mps = np.linalg.norm(moved, axis=1)
-    moving = speed_mps >= MOVING_MPS
+    linear, angular = stated[:, 3:], stated[:, :3]
+    of_velocity = _reading(
+        moved[:, 3:],
+        {
+            TwistReading.AS_STATED: linear,
+            TwistReading.PARENT_FRAME: np.einsum("nji,nj->ni", turned, linear),
+            TwistReading.BACKWARDS: -linear,
+            TwistReading.KM_PER_H: linear / 3.6,
+        },
+        MOVING_MPS,
+    )
+    if of_velocity is not TwistReading.AS_STATED:
+        return of_velocity
+    in_degrees = {TwistReading.AS_STATED: angular, TwistReading.DEGREES: np.radians(angular)}
+    of_turn = _reading(moved[:, :3], in_degrees, TURNING_RADPS)
+    if of_turn is TwistReading.NOT_FILLED_IN:
+        return TwistReading.NO_TURN
+    return of_turn if of_turn is TwistReading.DEGREES else TwistReading.AS_STATED
+
+
+def _reading(
+    moved: NDArray[np.float64], readings: Mapping[TwistReading, NDArray[np.float64]], least: float
+) -> TwistReading:
+    """The reading that fits what moved (N, 3) by the poses, where that is at least `least`."""
+    rate = np.linalg.norm(moved, axis=1)
+    moving = rate >= least
     if moving.sum() < LEAST_MOVES:
         return TwistReading.AS_STATED
-    moved, stated, turned, speed_mps = (values[moving] for values in (moved, stated, turned, speed_mps))
-    if np.median(np.linalg.norm(stated, axis=1)) <= STANDING_MPS:
+    if np.median(np.linalg.norm(readings[TwistReading.AS_STATED][moving], axis=1)) <= STANDING * least:
         return TwistReading.NOT_FILLED_IN
-    in_child = np.einsum("nji,nj->ni", turned, stated)
     off = {
-        TwistReading.AS_STATED: stated,
-        TwistReading.PARENT_FRAME: in_child,
-        TwistReading.BACKWARDS: -stated,
-        TwistReading.KM_PER_H: stated / 3.6,
+        reading: float(np.median(np.linalg.norm(values - moved, axis=1)[moving] / rate[moving]))
+        for reading, values in readings.items()
     }
-    shares = {
-        reading: float(np.median(np.linalg.norm(velocity - moved, axis=1) / speed_mps))
-        for reading, velocity in off.items()
-    }
-    best = min(shares, key=lambda reading: shares[reading])
-    if shares[best] > FITTING:
+    best = min(off, key=lambda reading: off[reading])
+    if off[best] > FITTING:
         return TwistReading.CONTRADICTED
-    return best if CLEARLY * shares[best] <= shares[TwistReading.AS_STATED] else TwistReading.AS_STATED
+    return best if CLEARLY * off[best] <= off[TwistReading.AS_STATED] else TwistReading.AS_STATED
 
 
 def motions_of_poses(messages: Sequence[PoseAndTwist]) -> tuple[EgoMotion, ...]:
@@ -114,20 +134,21 @@ def _intervals(messages: Sequence[PoseAndTwist]) -> list[tuple[int, int]]:
 
 
 def _compared(messages: Sequence[PoseAndTwist]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """(N, 3) linear velocities in the child frame by the poses, (N, 3) as stated, m/s, and (N, 3, 3) the rotation from
-    child to parent."""
+    """(N, 6) turn rates, rad/s, and velocities, m/s, in the child frame by the poses, (N, 6) as stated, and (N, 3, 3)
+    the rotation from child to parent."""
     moved, stated, turned = [], [], []
     for motion, (first, last) in zip(motions_of_poses(messages), _intervals(messages), strict=True):
         a, b = messages[first], messages[last]
         if a.motion.linear_mps is None or b.motion.linear_mps is None or a.T_parent_child is None:
             continue
-        moved.append(motion.linear_mps)
-        stated.append(0.5 * (np.array(a.motion.linear_mps) + np.array(b.motion.linear_mps)))
+        moved.append((*motion.angular_radps, *(motion.linear_mps or ())))
+        twists = [(*one.motion.angular_radps, *one.motion.linear_mps) for one in (a, b) if one.motion.linear_mps]
+        stated.append(np.mean(twists, axis=0))
         half = se3.rotation_exp(0.5e-9 * (b.stamp_ns - a.stamp_ns) * np.array(motion.angular_radps))
         turned.append(a.T_parent_child[:3, :3] @ half)
-    shape = (len(moved), 3)
+    count = len(moved)
     return (
-        np.array(moved, np.float64).reshape(shape),
-        np.array(stated, np.float64).reshape(shape),
-        np.array(turned, np.float64).reshape(*shape, 3),
+        np.array(moved, np.float64).reshape(count, 6),
+        np.array(stated, np.float64).reshape(count, 6),
+        np.array(turned, np.float64).reshape(count, 3, 3),
     )

@@ -554,8 +554,8 @@ def _unknown_time(
 ) -> tuple[str | None, NDArray[Any] | None, tuple[Recognition, ...]]:
     """The field that is the time of the points although no driver that is known calls it so, its column, and what to
     tell. A field that rises through the cloud and could be a time counts as one if its values lie on the clock of the
-    stamp, which chance does not bring about, or if its name means a time; a counter rises, too, so that any other is
-    only named."""
+    stamp, which chance does not bring about, or if its name means a time and the stamp lies at its begin, middle or
+    end; counters, and fractions of a second, rise, too, so that any other is only named."""
     times: list[tuple[str, NDArray[Any], TimeReading]] = []
     doubts: list[str] = []
     for name, field in by_name.items():
@@ -570,7 +570,7 @@ def _unknown_time(
             continue
         if reading.lasts_s < SHORTEST_S:
             continue
-        if reading.base == "clock" or LIKE_A_TIME.search(name):
+        if reading.base == "clock" or (LIKE_A_TIME.search(name) and reading.stamped):
             times.append((name, column, reading))
         else:
             way = f"`?time={name},{reading.unit},{reading.base}` (`lidar.time` live)"
