@@ -176,7 +176,9 @@ def calibrated(
         return estimate, None
     data = prepare_window_data(window, depth, images, configuration, progress)
     mistake = probable_mistake(data, estimate.optimum.T_camera_lidar)
-    if mistake is None or mistake.code == CLOCK_OFFSET:
+    reasons = {reason.code for reason in estimate.verdict.reasons}
+    # Another focal length looks like other stamps of a vehicle that drives ahead.
+    if mistake.code == CLOCK_OFFSET if mistake is not None else calibration.INTRINSICS_OFF not in reasons:
         mistake = _measured_offset(window, images, estimate, configuration, mistake) or mistake
     progress.step("mistakes", 1, 1)
     return estimate, mistake
@@ -212,6 +214,10 @@ def _measured_offset(
         "are stamped at another point: correct the stamps in the driver and record again; of a bag, "
         f"?camera_offset={offset.offset_s:.4f} is added to the stamps of the camera"
     )
+    if not offset.observable:
+        speeds_mps = [pair.motion.speed_mps or 0.0 for pair in window.pairs if pair.motion is not None]
+        shift_m = abs(offset.offset_s) * float(np.median(speeds_mps))
+        text += f". Straight driving looks the same if the camera is {shift_m:.2f} m off along the road"
     if mistake is not None:
         return replace(mistake, text=text)
     rig = window.rig

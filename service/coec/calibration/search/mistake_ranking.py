@@ -26,10 +26,12 @@ from coec.calibration.search.mistakes import (
     BACKWARDS,
     CLOCK_OFFSET,
     COMPENSATED,
+    FOCAL_LENGTH,
     IMAGE_SCALE,
     KINDS,
     TURNED_90,
     Supposition,
+    changed,
     suppositions,
 )
 from coec.calibration.solver import WindowData
@@ -97,6 +99,9 @@ LEAST_TIMED = 6
 LATER = (-1.0, -0.5, -0.15, 0.15, 0.5, 1.0)
 """By how many sweeps clouds may be later than their stamps say: a frame; from the middle of a sweep to its end; or the
 delay of an exposure."""
+
+NEAR_ZOOMS = (0.95, 0.97, 0.98, 0.99, 1.01, 1.02, 1.03, 1.05)
+"""Ratios of the right focal length to the given one that may be taken for wrong motion."""
 
 SAME_ASPECT = 0.02
 """Relative difference of the aspect ratios of an image and of the same image in another size, at most."""
@@ -196,8 +201,9 @@ def _named(best: Ranked, given: Ranked) -> Mistake:
 
 def _other_time(data: WindowData, edges: Edges, given: Ranked) -> tuple[float, Ranked | None]:
     """The clouds as they are, if a driver has compensated them for motion, or for the opposite motion, or some seconds
-    later: which fits best, and by how many seconds it is later. None if none is more probable than the inputs as given
-    by `LEAST_ODDS`, for vehicles that hardly move, and where no times are known."""
+    later: which fits best, and by how many seconds it is later. None if none is more probable by `LEAST_ODDS` than the
+    inputs as given and than a slightly other focal length, which looks like motion ahead; for vehicles that hardly
+    move, and where no times are known."""
     part = _some_pairs(data)
     sweep_s = _sweep_duration_s(part)
     moving = any(pair.motion is not None and pair.motion.reaches(LEAST_SPEED_MPS) for pair in part.window.pairs)
@@ -215,9 +221,15 @@ def _other_time(data: WindowData, edges: Edges, given: Ranked) -> tuple[float, R
         end = _settled(moved, _local_ascent(moved, supposition, starts), given.null)
         odds = 0.0 if code == AS_GIVEN else log(KINDS[code].odds / AS_GIVEN_ODDS)
         ends.append((late_s, replace(end, log_posterior=end.log_posterior + odds)))
-    as_given, *others = ends
-    best = max(others, key=lambda end: end[1].log_posterior)
-    return best if best[1].log_posterior - as_given[1].log_posterior >= log(LEAST_ODDS) else (0.0, None)
+    rivals, as_given, camera = [ends[0][1]], ends[0][1], given.supposition.camera
+    for zoom in NEAR_ZOOMS:
+        supposition = replace(given.supposition, camera=changed(camera, fx=zoom * camera.fx, fy=zoom * camera.fy))
+        rival = _settled(edges, _local_ascent(edges, supposition, [as_given.T_camera_lidar]), given.null)
+        odds = log(KINDS[FOCAL_LENGTH].odds / AS_GIVEN_ODDS)
+        rivals.append(replace(rival, log_posterior=rival.log_posterior + odds))
+    best = max(ends[1:], key=lambda end: end[1].log_posterior)
+    least = max(rival.log_posterior for rival in rivals) + log(LEAST_ODDS)
+    return best if best[1].log_posterior >= least else (0.0, None)
 
 
 def _sweep_duration_s(data: WindowData) -> float:
