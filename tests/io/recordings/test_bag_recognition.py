@@ -134,10 +134,10 @@ def test_clouds_of_two_lidars_on_one_topic_are_reported(tmp_path: Path) -> None:
     other = [(topic, cloud_at(message, 30 * MS, "rear")) for topic, message in turns()]
     with pytest.raises(SourceError, match="in the frames 'lidar' and 'rear': two LiDARs publish on it"):
         opened(tmp_path, [*ELSE, *odometry(), *turns(), *other])
-    beside = [(topic, cloud_at(message, 0)) for topic, message in turns(count=9)[1:]]
-    for (_, message), (_, first) in zip(beside, turns(), strict=True):
+    second = [(topic, cloud_at(message, 0)) for topic, message in turns(count=9)[1:]]
+    for (_, message), (_, first) in zip(second, turns(), strict=True):
         message.header = first.header
-    assert codes(opened(tmp_path, [*ELSE, *odometry(), *turns(), *beside])) == ["several_lidars"]
+    assert codes(opened(tmp_path, [*ELSE, *odometry(), *turns(), *second])) == ["several_lidars"]
     assert codes(opened(tmp_path, [*ELSE, *odometry(), *turns(), *turns()])) == [], "each cloud twice"
     # Two halves without times are either.
     assert codes(opened(tmp_path, [*ELSE, *odometry(), *turns(2, timed=False)])) == ["several_lidars"]
