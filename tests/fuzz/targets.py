@@ -244,7 +244,7 @@ POINTS = struct.pack("<12f", *range(12))
 def _pcd_seeds() -> list[bytes]:
     xyz = ("x y z", "4 4 4", "F F F")
     more = ("x y z intensity ring t", "4 4 4 4 2 4", "F F F F U U")
-    rows = b"".join(struct.pack("<4fHI", i, i, i, i, i, i) for i in range(3))
+    rows = b"".join(struct.pack("<4fHI", i, i, i, i, i, i * 50_000_000) for i in range(3))
     columns = struct.pack("<6f", 1, 2, 3, 4, 5, 6)
     return [
         pcd(*xyz, 4, "ascii", b"1 2 3\n" * 4),
@@ -252,8 +252,24 @@ def _pcd_seeds() -> list[bytes]:
         pcd(*xyz, 2, "binary_compressed", struct.pack("<II", 25, 24) + bytes([23]) + columns),
         pcd(*xyz, 20, "binary_compressed", struct.pack("<II", 5, 240) + bytes([0, 0, 0xE0, 230, 0])),
         pcd(*more, 3, "binary", rows),
-        pcd("_ x y z time", "1 8 8 8 4", "U F F F F", 1, "ascii", b"1 1 1 2 3 0.5\n", counts="2 1 1 1 1"),
+        pcd("_ x y z time", "1 8 8 8 4", "U F F F F", 1, "ascii", b"1 1 1 2 3 0\n", counts="2 1 1 1 1"),
     ]
+
+
+def _ply_seeds() -> list[bytes]:
+    head = "ply\nformat {} 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n{}end_header\n"
+    more = "property uchar scalar_ring\nproperty double time\nelement face 1\nproperty list uchar int i\n"
+    return [
+        head.format("ascii", "").encode() + b"1 2 3\n4 5 6\n",
+        head.format("binary_little_endian", more).encode() + (POINTS[:12] + bytes(9)) * 2,
+        head.format("binary_big_endian", "").encode() + POINTS[:24],
+    ]
+
+
+def _bin_seeds() -> list[bytes]:
+    five = np.random.default_rng(0).normal(size=(400, 5)).astype("<f4")
+    five[:, 3:] = np.abs(five[:, 3:])
+    return [POINTS, five.tobytes()]
 
 
 def _npy_seeds() -> list[bytes]:
@@ -262,6 +278,8 @@ def _npy_seeds() -> list[bytes]:
         np.ones((4, 4), np.float32),
         np.asfortranarray(np.ones((2, 3), ">f8")),
         np.ones((3, 4), "f2"),
+        np.arange(48.0).reshape(8, 6) // 3,
+        np.zeros(2, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("ring", "u1"), ("t", "u4")]),
     )
     return [npy(array) for array in arrays]
 
@@ -310,6 +328,8 @@ def _manifest_seeds() -> list[bytes]:
         f"pair: front\ncamera: {{image_width: 64, image_height: 48, distortion_model: plumb_bob, camera_matrix: "
         f"{{data: [50, 0, 31, 0, 50, 23, 0, 0, 1]}}, distortion_coefficients: {{data: [0, 0, 0, 0, 0]}}}}\n"
         f"T_camera_lidar: {IDENTITY}\nframes: [{{image: a.png, cloud: a.bin, stamp_ns: 1}}]\n",
+        f"pair: front\ncamera: {CAMERA}\nT_camera_lidar: {IDENTITY}\ncloud_columns: [x, y, z, _]\n"
+        "cloud_time: {field: t, unit: us}\nframes: [{image: a.png, cloud: a.bin, stamp_ns: 1}]\n",
     ]
     return [text.encode() for text in texts]
 
@@ -796,6 +816,10 @@ TARGETS: Final = {
         Target(
             "npy", lambda data, folder: _cloud_file(data, folder, "npy"), _npy_seeds, labels=(b"'<f8'", b"True", b"(")
         ),
+        Target(
+            "ply", lambda data, folder: _cloud_file(data, folder, "ply"), _ply_seeds, labels=(b"element", b"property")
+        ),
+        Target("bin", lambda data, folder: _cloud_file(data, folder, "bin"), _bin_seeds),
         Target("npz", lambda data, folder: _cloud_file(data, folder, "npz"), _npz_seeds, (in_archive,)),
         Target("manifest", _manifest, _manifest_seeds, (in_yaml,), (*YAML_TEXT, b"depth", b"double_sphere", b"mei")),
         Target("kitti", _kitti, lambda: [b"R: 1 0 0\nT: 1 2 3\n", b"2013-05-28 08:46:02.904483072\n"]),

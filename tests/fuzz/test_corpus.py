@@ -91,6 +91,14 @@ def test_pcd(held: Replay) -> None:
     held("pcd")
 
 
+def test_ply(held: Replay) -> None:
+    held("ply")
+
+
+def test_bin(held: Replay) -> None:
+    held("bin")
+
+
 @pytest.mark.fault("a `.npy` file, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
 def test_npy(held: Replay) -> None:
     held("npy")

@@ -192,7 +192,7 @@ def _show(name: str, seen: Fitness, trial: Estimate | CalibrationError | None) -
         _show_trial(trial)
     for note in seen.remarks:
         console.show(f"{note.level:4}  {note.text}", LEVEL_STYLES[note.level])
-    if not seen.remarks:
+    if all(note.level == "ok" for note in seen.remarks):
         console.show("nothing is missing", "green")
 
 

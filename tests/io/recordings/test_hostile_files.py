@@ -18,7 +18,8 @@ from ruamel.yaml.scanner import Scanner
 from coec.config import MAX_YAML_BYTES, load_config, load_yaml, parse_yaml
 from coec.errors import CoecError, ConfigError, SourceError
 from coec.io import user_files
-from coec.io.recordings.cloud_files import MAX_TABLE_BYTES, MAX_UNPACKED_BYTES, PcdError, load_cloud, parse_pcd
+from coec.io.recordings.cloud_files import load_cloud
+from coec.io.recordings.cloud_tables import MAX_TABLE_BYTES, MAX_UNPACKED_BYTES, TableError, parse_pcd
 from coec.io.recordings.kitti import read_numbers, read_stamps
 from coec.io.recordings.layouts import open_source
 from support.recordings import npy, npy_with_header, npz, pcd
@@ -95,7 +96,7 @@ def test_padding_fields_may_have_any_name(fields: str) -> None:
     count = len(fields.split())
     data = pcd(fields, "4 " * count, "F " * count, 1, "binary", struct.pack(f"<{count}f", *range(count)))
     places = [fields.split().index(axis) for axis in "xyz"]
-    assert parse_pcd(data)["xyz"].tolist() == [places]
+    assert [parse_pcd(data)[axis].tolist() for axis in "xyz"] == [[place] for place in places]
 
 
 @pytest.mark.fault("the header of a PCD that promises gigabytes", "it is refused without their memory")
@@ -123,7 +124,7 @@ def test_padding_fields_may_have_any_name(fields: str) -> None:
 def test_no_header_of_a_pcd_makes_it_large(data: bytes) -> None:
     tracemalloc.start()
     try:
-        with pytest.raises(PcdError):
+        with pytest.raises(TableError):
             parse_pcd(data)
         assert tracemalloc.get_traced_memory()[1] < MAX_TABLE_BYTES
     finally:
@@ -139,21 +140,21 @@ def test_much_of_a_small_compressed_file_stays_within_its_bound() -> None:
     data = pcd(*XYZ, points, "binary_compressed", struct.pack("<II", len(packed), points * 12) + packed)
     tracemalloc.start()
     try:
-        assert len(parse_pcd(data)["xyz"]) == points
+        assert len(parse_pcd(data)) == points
         assert tracemalloc.get_traced_memory()[1] < 6 * 2 * MB
     finally:
         tracemalloc.stop()
 
 
 def test_text_rows_are_read_in_blocks_with_the_right_place_of_a_complaint(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("coec.io.recordings.cloud_files.ASCII_BLOCK_BYTES", 20)
+    monkeypatch.setattr("coec.io.recordings.cloud_tables.ASCII_BLOCK_BYTES", 20)
     rows = [f"{i} {i} {i}" for i in range(50)]
     head = pcd(*XYZ, 50, "ascii")
-    assert parse_pcd(head + "\n".join(rows).encode())["xyz"].tolist() == [[i] * 3 for i in range(50)]
+    assert parse_pcd(head + "\n".join(rows).encode())["z"].tolist() == list(range(50))
     bad = [*rows[:33], "1 2 x", *rows[34:]]
-    with pytest.raises(PcdError, match=f"line {len(head.splitlines()) + 34}: not a number"):
+    with pytest.raises(TableError, match=f"line {len(head.splitlines()) + 34}: not a number"):
         parse_pcd(head + "\n".join(bad).encode())
-    with pytest.raises(PcdError, match="ends after 49 of 50"):
+    with pytest.raises(TableError, match="ends after 49 of 50"):
         parse_pcd(head + "\n".join(rows[:49]).encode() + b"\n\n")
 
 

@@ -14,6 +14,7 @@ from coec.errors import SourceError
 from coec.geometry import cameras, se3
 from coec.io.images import decode_bgr, decode_depth
 from coec.io.recordings.layouts import open_source
+from support.recordings import pcd
 from support.scenes import ROOF_POSE, sweep_in_frame, turning_sweep
 
 LIMITS = LimitsConfig()
@@ -137,6 +138,9 @@ FRAME = {"image": "1.jpg", "cloud": "1.npy", "stamp_ns": 0}
         ({"mask": "absent.png"}, "cannot read mask"),
         ({"mask": "depth.png"}, "the mask is 16 x 12 px"),
         ({"pair": "front/left"}, "pair: String should match"),
+        ({"cloud_columns": ["x", "y", "intensity"]}, r"cloud_columns: .*has to name x, y and z"),
+        ({"cloud_columns": ["x", "y", "z", "z"]}, r"cloud_columns: .*no column twice"),
+        ({"cloud_time": {"field": "t", "unit": "h"}}, "cloud_time"),
     ],
 )
 def test_what_the_contract_does_not_allow_is_refused_by_place(
@@ -173,6 +177,41 @@ def test_what_people_write_by_mistake_is_refused_with_the_way_out(
     a_dataset(tmp_path, **changes)
     with pytest.raises(SourceError, match=way_out):
         open_source(str(tmp_path))
+
+
+def first_sweep(folder: Path) -> LidarFrame:
+    return next(m for m in open_source(str(folder)).messages() if isinstance(m, LidarFrame))
+
+
+def test_what_is_recognised_in_the_clouds_is_reported_and_can_be_overridden(tmp_path: Path) -> None:
+    a_dataset(tmp_path, frames=[FRAME])
+    np.save(tmp_path / "1.npy", np.column_stack([np.ones((5, 4)), np.arange(5) * 0.02]))
+    (recognition,) = first_sweep(tmp_path).recognitions
+    assert (recognition.level, recognition.code) == ("ok", "cloud_columns")
+    assert "read as x y z intensity _" in recognition.text
+    a_dataset(
+        tmp_path,
+        frames=[FRAME],
+        cloud_columns=["x", "y", "z", "_", "late"],
+        cloud_time={"field": "late", "unit": "s"},
+    )
+    np.save(tmp_path / "1.npy", np.column_stack([np.ones((5, 4)), np.arange(5) * 0.02]))
+    sweep = first_sweep(tmp_path)
+    assert sweep.recognitions == ()
+    assert sweep.intensity is None
+    assert sweep.time_offset_s is not None
+    assert sweep.time_offset_s[-1] == pytest.approx(0.08)
+
+
+@pytest.mark.parametrize(("viewpoint", "codes"), [("0 0 0 1 0 0 0", []), ("1 0.5 0.2 0.99 0 0 0.1", ["viewpoint"])])
+def test_a_viewpoint_is_not_applied_but_named(tmp_path: Path, viewpoint: str, codes: list[str]) -> None:
+    head = pcd("x y z", "4 4 4", "F F F", 1, "ascii").replace(b"WIDTH", f"VIEWPOINT {viewpoint}\nWIDTH".encode())
+    (tmp_path / "1.pcd").write_bytes(head + b"1 2 3\n")
+    a_dataset(tmp_path, frames=[{**FRAME, "cloud": "1.pcd"}])
+    sweep = first_sweep(tmp_path)
+    assert [recognition.code for recognition in sweep.recognitions] == codes
+    assert all("T_cloud_lidar" in recognition.text for recognition in sweep.recognitions)
+    assert sweep.xyz_m.tolist() == [[1, 2, 3]]
 
 
 def test_the_extrinsic_in_other_forms_and_directions(tmp_path: Path) -> None:

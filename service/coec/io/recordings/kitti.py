@@ -21,7 +21,7 @@ from coec.config import LimitsConfig
 from coec.errors import DecodeError, SourceError
 from coec.geometry import cameras
 from coec.io.images import probe
-from coec.io.recordings.cloud_files import load_cloud
+from coec.io.recordings.cloud_files import XYZI, CloudLayout, load_cloud
 from coec.io.recordings.recording_source import FramewiseRecording, RecordedFrame, SourceSpec
 from coec.io.user_files import read_bytes
 
@@ -230,7 +230,7 @@ def open_kitti_raw(spec: SourceSpec) -> FramewiseRecording:
             stamps_ns[index],
             partial(load_camera, stamps_ns[index], camera, images[index], None),
             stamps_ns[index],
-            partial(load_cloud, stamps_ns[index], LIDAR_FRAME, clouds[index]),
+            partial(load_cloud, stamps_ns[index], LIDAR_FRAME, clouds[index], CloudLayout(XYZI)),
         )
         for index in indices
     ]

@@ -24,7 +24,7 @@ from coec.config import parse_yaml
 from coec.errors import ConfigError, SourceError
 from coec.geometry import cameras, se3
 from coec.io.recordings import kitti
-from coec.io.recordings.cloud_files import load_cloud
+from coec.io.recordings.cloud_files import XYZI, CloudLayout, load_cloud
 from coec.io.recordings.recording_source import FramewiseRecording, RecordedFrame, SourceSpec
 
 PERSPECTIVE = {"image_00": "00", "image_01": "01"}
@@ -79,7 +79,7 @@ def open_kitti360(spec: SourceSpec) -> FramewiseRecording:
                 stamp_ns,
                 partial(kitti.load_camera, stamp_ns, camera, images[index], depths.get(index)),
                 stamp_ns,
-                partial(load_cloud, stamp_ns, LIDAR_FRAME, clouds[index]),
+                partial(load_cloud, stamp_ns, LIDAR_FRAME, clouds[index], CloudLayout(XYZI)),
             )
         )
     calibration = root / "calibration"

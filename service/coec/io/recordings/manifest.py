@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from coec.calibration.frames.lidar_origin import ApparentOrigin, SeveralOrigins
 from coec.calibration.types import (
@@ -28,12 +28,21 @@ from coec.calibration.types import (
     Matrix4,
     Rig,
 )
-from coec.config import IDENTITY, CameraIntrinsics, FilePath, LimitsConfig, Name, describe, load_yaml
+from coec.config import (
+    IDENTITY,
+    CameraIntrinsics,
+    FilePath,
+    LimitsConfig,
+    Name,
+    PointTimeConfig,
+    describe,
+    load_yaml,
+)
 from coec.config.pose_forms import Pose, with_direction
 from coec.errors import ConfigError, DecodeError, SourceError
 from coec.io.images import encode_depth_png, probe, raw_image
 from coec.io.recordings.bag_index import with_ros_camera_info
-from coec.io.recordings.cloud_files import load_cloud, measured_from
+from coec.io.recordings.cloud_files import MAX_COLUMNS, CloudLayout, load_cloud, measured_from
 from coec.io.recordings.kitti import load_image
 from coec.io.recordings.recording_source import FramewiseRecording, RecordedFrame, SourceSpec
 from coec.io.rig_files import camera_of, load_mask
@@ -84,12 +93,27 @@ class ManifestDocument(_Strict):
     T_cloud_lidar: Pose = Field(
         default=IDENTITY, description="pose of the LiDAR in the frame in which the points are given"
     )
+    cloud_columns: tuple[Annotated[str, Field(max_length=64)], ...] = Field(
+        default=(),
+        max_length=MAX_COLUMNS,
+        description="names of the columns of .bin and .npy, _ for one that is unused",
+    )
+    cloud_time: PointTimeConfig | None = Field(
+        default=None, description="how the points of .pcd, .ply, .bin and .npy are timed, if their values leave it open"
+    )
     frames: tuple[FrameDocument, ...] = Field(min_length=1)
 
     @model_validator(mode="before")
     @classmethod
     def _with_direction(cls, document: Any) -> Any:
         return with_direction(document)
+
+    @field_validator("cloud_columns")
+    @classmethod
+    def _with_places(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if names and (not {"x", "y", "z"} <= set(names) or len(set(names) - {"_"}) < len(names) - names.count("_")):
+            raise ValueError("has to name x, y and z, and no column twice")
+        return names
 
 
 def open_manifest(spec: SourceSpec) -> FramewiseRecording:
@@ -137,6 +161,7 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
     _check_frames(path, frames)
     depths = [path.parent / frame.depth for frame in frames if frame.depth is not None]
     scale = _DepthScale([depth for depth in depths if depth.suffix == ".npy"])
+    layout = CloudLayout(document.cloud_columns, document.cloud_time)
     motions = [
         EgoMotion(frame.stamp_ns, LIDAR_FRAME, frame.twist.linear_mps, frame.twist.angular_radps)
         for frame in frames
@@ -146,7 +171,7 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
         f"{path.parent.name}/{document.pair}",
         rig,
         T_camera_lidar,
-        tuple(_recorded(path.parent, frame, scale, T_cloud_lidar) for frame in frames),
+        tuple(_recorded(path.parent, frame, scale, T_cloud_lidar, layout) for frame in frames),
         tuple(motions),
     )
 
@@ -192,13 +217,15 @@ def _cloud_stamp_ns(frame: FrameDocument) -> int:
     return frame.stamp_ns if frame.cloud_stamp_ns is None else frame.cloud_stamp_ns
 
 
-def _recorded(folder: Path, frame: FrameDocument, scale: _DepthScale, T_cloud_lidar: Matrix4) -> RecordedFrame:
+def _recorded(
+    folder: Path, frame: FrameDocument, scale: _DepthScale, T_cloud_lidar: Matrix4, layout: CloudLayout
+) -> RecordedFrame:
     cloud_stamp_ns = _cloud_stamp_ns(frame)
     return RecordedFrame(
         frame.stamp_ns,
         partial(_load_camera, folder, frame, scale),
         cloud_stamp_ns,
-        partial(_load_lidar, folder / frame.cloud, cloud_stamp_ns, T_cloud_lidar),
+        partial(_load_lidar, folder / frame.cloud, cloud_stamp_ns, T_cloud_lidar, layout),
     )
 
 
@@ -208,8 +235,8 @@ _ADVICE = {
 }
 
 
-def _load_lidar(path: Path, stamp_ns: int, T_cloud_lidar: Matrix4) -> LidarFrame:
-    return measured_from(load_cloud(stamp_ns, LIDAR_FRAME, path), T_cloud_lidar, LIDAR_FRAME, path, _ADVICE)
+def _load_lidar(path: Path, stamp_ns: int, T_cloud_lidar: Matrix4, layout: CloudLayout) -> LidarFrame:
+    return measured_from(load_cloud(stamp_ns, LIDAR_FRAME, path, layout), T_cloud_lidar, LIDAR_FRAME, path, _ADVICE)
 
 
 def _load_camera(folder: Path, frame: FrameDocument, scale: _DepthScale) -> CameraFrame:
