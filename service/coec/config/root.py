@@ -12,6 +12,7 @@ from typing import Any, Literal, TypeVar
 from pydantic import BaseModel, Field, ValidationError, model_validator
 from ruamel.yaml import YAML
 from ruamel.yaml.composer import Composer
+from ruamel.yaml.constructor import SafeConstructor
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
 from coec.config import service
@@ -216,6 +217,7 @@ def parse_yaml(text: str) -> Any:
     reader = YAML(typ="safe", pure=True)
     reader.max_depth = MAX_YAML_DEPTH
     reader.Composer = _BoundedComposer
+    reader.Constructor = _Constructor
     try:
         document = reader.load(text)
     except ConfigError:
@@ -255,6 +257,13 @@ class _BoundedComposer(Composer):
         if node.tag == MERGE:
             raise ConfigError("`<<` is no part of YAML 1.2: write the keys out, or give a whole value by its alias")
         return node
+
+
+class _Constructor(SafeConstructor):
+    """Also knows the matrices of OpenCV's FileStorage, which are mappings."""
+
+
+_Constructor.add_constructor("tag:yaml.org,2002:opencv-matrix", SafeConstructor.construct_yaml_map)
 
 
 def _check_extent(document: object) -> None:

@@ -186,7 +186,7 @@ def test_camera_info_becomes_a_camera(tmp_path: Path, info: Any, expected: tuple
 @pytest.mark.parametrize(
     ("info", "complaint"),
     [
-        (camera_info_message("rational_polynomial", [0.1] * 14), "thin prisms"),
+        (camera_info_message("rational_polynomial", [0.1] * 14), "a tilted sensor"),
         (camera_info_message("oblique", [0.1] * 4), "distortion model of this name is not known"),
         (camera_info_message("equidistant", [0.1] * 3), "parameters k1 k2 k3 k4; here are 3"),
         (camera_info_message("plumb_bob", [], width=63), "images are 64 x 48 px, the intrinsics are for 63 x 48"),

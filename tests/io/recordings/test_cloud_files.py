@@ -335,7 +335,7 @@ def test_times_of_a_pcd_are_recognised_as_in_messages(tmp_path: Path, name: str,
     assert frame.timed_by.startswith(name)
 
 
-def test_times_on_a_clock_that_the_stamp_does_not_share_are_left_out_and_said(tmp_path: Path) -> None:
+def test_times_on_a_clock_that_the_stamp_does_not_share_are_left_out(tmp_path: Path) -> None:
     rows = np.zeros(3, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("timestamp", "<f8")])
     rows["timestamp"], rows["x"] = STAMP_NS * 1e-9, 5.0
     path = tmp_path / "cloud.pcd"

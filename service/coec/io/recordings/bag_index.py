@@ -15,12 +15,13 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
-from coec.config import CameraIntrinsics, FilePath, LimitsConfig, Matrix4x4, PointTimeConfig, describe, load_yaml
+from coec.config import CameraIntrinsics, FilePath, LimitsConfig, Matrix4x4, PointTimeConfig, describe
 from coec.config.pose_forms import with_direction
 from coec.errors import ConfigError, DecodeError, SourceError, UsageError
+from coec.io.intrinsics_files import load_camera_document, with_camera
 from coec.io.recordings.bag_storage import BagMessage, BagReader, BagStorage
 from coec.io.rig_files import camera_of, load_mask, rigid_matrix
 from coec.io.ros import camera_info, message_decoding, messages
@@ -215,35 +216,6 @@ def _header_stamp_ns(data: bytes) -> int | None:
     return seconds * 1_000_000_000 + nanoseconds if seconds >= 0 and nanoseconds < 1_000_000_000 else None
 
 
-_PATH: TypeAdapter[Path] = TypeAdapter(FilePath)
-
-
-def with_ros_camera_info(document: Any, path: Path, rectified: bool) -> Any:
-    """The document of a file with a `camera:`, in which that may be a `camera_info.yaml` of ROS: its content, or its
-    path. The whole file may be one, too. Any other document is returned as it is.
-
-    Raises:
-        SourceError: it is a `CameraInfo` that describes no lens.
-        ConfigError: the named file cannot be read.
-        ValidationError: its name is no path.
-    """
-    whole = camera_info.info_of_yaml(document) is not None
-    camera = document if whole else document.get("camera") if isinstance(document, dict) else None
-    if isinstance(camera, str):
-        path = path.parent / _PATH.validate_python(camera)
-        if not path.is_file():
-            raise SourceError(f"camera: there is no file {path}; give the lens here, or name a camera_info.yaml")
-        camera = load_yaml(path)
-    try:
-        info = camera_info.info_of_yaml(camera)
-        if info is None:
-            return document
-        intrinsics = camera_info.intrinsics_of_info(info, rectified=rectified).intrinsics.model_dump(exclude_none=True)
-    except SourceError as error:
-        raise SourceError(f"{path}, a CameraInfo: {error}") from error
-    return {"camera": intrinsics} if whole else {**document, "camera": intrinsics}
-
-
 class IntrinsicsFile(BaseModel):
     """`intrinsics=FILE`: the head of a `dataset.yaml`, for bags without camera info or without a transform."""
 
@@ -283,9 +255,9 @@ def rig_of_bag(
             camera = camera_of(_lens(index, info, image_topic).intrinsics)
         else:
             path = expand_home(intrinsics)
-            document = IntrinsicsFile.model_validate(
-                with_ros_camera_info(load_yaml(path), path, camera_info.is_rectified(image_topic))
-            )
+            content, name = load_camera_document(path)
+            size, rectified = (image.image.width, image.image.height), camera_info.is_rectified(image_topic)
+            document = IntrinsicsFile.model_validate(with_camera(content, path, name, rectified=rectified, size=size))
             camera = camera_of(document.camera)
             if document.T_camera_lidar is not None:
                 T_camera_lidar = rigid_matrix(document.T_camera_lidar, "T_camera_lidar")

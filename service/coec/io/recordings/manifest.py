@@ -36,17 +36,15 @@ from coec.config import (
     Name,
     PointTimeConfig,
     describe,
-    load_yaml,
 )
 from coec.config.pose_forms import Pose, with_direction
 from coec.errors import ConfigError, DecodeError, SourceError
 from coec.io.images import encode_depth_png, probe, raw_image
-from coec.io.recordings.bag_index import with_ros_camera_info
+from coec.io.intrinsics_files import cameras_of, load_camera_document, with_camera
 from coec.io.recordings.cloud_files import MAX_COLUMNS, CloudLayout, load_cloud, measured_from
 from coec.io.recordings.kitti import load_image
 from coec.io.recordings.recording_source import FramewiseRecording, RecordedFrame, SourceSpec
 from coec.io.rig_files import camera_of, load_mask
-from coec.io.ros.camera_info import info_of_yaml
 from coec.io.user_files import read_bytes, read_npy
 
 FILE_NAME = "dataset.yaml"
@@ -129,16 +127,16 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
     if not path.is_file():
         raise SourceError(f"{spec.path} has no {FILE_NAME}; for a KITTI folder write kitti360:... or kitti-raw:...")
     try:
-        text = load_yaml(path)
+        text, _ = load_camera_document(path)
     except ConfigError as error:
         raise SourceError(str(error)) from error
-    if info_of_yaml(text) is not None:
+    if cameras_of(text, (1, 1)):
         raise SourceError(
-            f"{path} is a ROS camera calibration, not a list of frames: name it as `camera: {path.name}` "
+            f"{path} holds the intrinsics of a camera, not a list of frames: name it as `camera: {path.name}` "
             f"in a {FILE_NAME}, or behind a bag as BAG?intrinsics={path.name}"
         )
     try:
-        document = ManifestDocument.model_validate(with_ros_camera_info(text, path, rectified=False))
+        document = ManifestDocument.model_validate(with_camera(text, path))
         camera = camera_of(document.camera)
         T_camera_lidar = np.array(document.T_camera_lidar, dtype=np.float64)
         T_cloud_lidar = np.array(document.T_cloud_lidar, dtype=np.float64)

@@ -234,7 +234,8 @@ def _polynomial(d: Sequence[float]) -> tuple[str, dict[str, float]]:
         raise SourceError(f"plumb_bob has four or five coefficients, rational_polynomial eight, this camera {len(d)}")
     names = DISTORTION["rational"][1]
     if any(d[len(names) :]):
-        raise SourceError("thin prisms and tilted sensors (d beyond its eighth) are no camera model here")
+        what = "a tilted sensor (tau)" if any(d[12:]) else "thin prisms (s1 to s4)"
+        raise SourceError(f"{what} in d beyond its eighth: no camera model here has that; calibrate with eight")
     values = dict(zip(names, (*d, *(0.0,) * len(names)), strict=False))
     for model in ("pinhole", "radtan", "rational"):
         parameters = DISTORTION[model][1]
