@@ -331,8 +331,8 @@ def _manifest_seeds() -> list[bytes]:
         f"pair: front\ncamera: {{cam0: {{camera_model: ds, intrinsics: [0.1, 0.5, 4, 4, 3.5, 3.5], distortion_model: "
         f"none, resolution: [8, 8]}}}}\nT_camera_lidar: {IDENTITY}\n"
         "frames: [{image: a.png, cloud: a.bin, stamp_ns: 1}]\n",
-        "pair: front\ncamera: {value0: {intrinsics: [{camera_type: kb4, intrinsics: {fx: 4, fy: 4, cx: 3, cy: 3, k1: 0, "
-        f"k2: 0, k3: 0, k4: 0}}}}], resolution: [[8, 8]]}}}}\nT_camera_lidar: {IDENTITY}\n"
+        "pair: front\ncamera: {value0: {intrinsics: [{camera_type: kb4, intrinsics: {fx: 4, fy: 4, cx: 3, cy: 3, "
+        f"k1: 0, k2: 0, k3: 0, k4: 0}}}}], resolution: [[8, 8]]}}}}\nT_camera_lidar: {IDENTITY}\n"
         "frames: [{image: a.png, cloud: a.bin, stamp_ns: 1}]\n",
         f"pair: front\ncamera: {CAMERA}\nT_camera_lidar: {IDENTITY}\ncloud_columns: [x, y, z, _]\n"
         "cloud_time: {field: t, unit: us}\nframes: [{image: a.png, cloud: a.bin, stamp_ns: 1}]\n",

@@ -130,12 +130,12 @@ def with_camera(
         if name not in candidates and (name or len(candidates) > 1):
             listed = ", ".join(f"{path.name}#{known}" for known in candidates)
             raise SourceError(f"it has several cameras: name one, {listed}")
-        chosen = candidates[name] if name in candidates else next(iter(candidates.values()))
-        lens = intrinsics_of_info(chosen.info, rectified=rectified).intrinsics.model_dump(exclude_none=True)
+        selected = candidates[name] if name in candidates else next(iter(candidates.values()))
+        lens = intrinsics_of_info(selected.info, rectified=rectified).intrinsics.model_dump(exclude_none=True)
     except SourceError as error:
         raise SourceError(f"{path}, intrinsics of a camera: {error}") from error
-    beside = {} if chosen.T_camera_lidar is None else {"T_camera_lidar": chosen.T_camera_lidar}
-    return {**beside, "camera": lens} if whole else {**document, "camera": lens}
+    extrinsic = {} if selected.T_camera_lidar is None else {"T_camera_lidar": selected.T_camera_lidar}
+    return {**extrinsic, "camera": lens} if whole else {**document, "camera": lens}
 
 
 def _is_list(value: Any, number: int) -> bool:
