@@ -183,6 +183,14 @@ SHORT = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7)]
 MAX = 2**32 - 1
 
 
+@pytest.mark.parametrize("row_step", [0, 12, 24, 48, MAX])
+@pytest.mark.parametrize("height", [1, 2])
+def test_rows_whose_distance_a_driver_states_wrong_follow_one_another(row_step: int, height: int) -> None:
+    data = np.arange(12, dtype="<f4")
+    frame = sweep(cloud(SHORT, data.tobytes(), 4 // height, 12, height=height, row_step=row_step))
+    assert np.array_equal(frame.xyz_m, data.reshape(4, 3))
+
+
 @pytest.mark.parametrize(
     ("payload", "reason"),
     [
@@ -200,8 +208,9 @@ MAX = 2**32 - 1
         (cloud([("x", MAX, 7), *SHORT[1:]], bytes(12), 1, 12), "cloud_shape"),
         (cloud(SHORT, bytes(24), 2, 0), "cloud_shape"),
         (cloud(SHORT, bytes(24), 3, 12), "cloud_shape"),
-        (cloud(SHORT, bytes(24), 2, 12, row_step=12), "cloud_shape"),
-        (cloud(SHORT, bytes(24), 1, 12, height=2, row_step=MAX), "cloud_shape"),
+        (cloud(SHORT, bytes(23), 2, 12, row_step=12), "cloud_shape"),
+        (cloud(SHORT, bytes(25), 1, 12, height=2, row_step=MAX), "cloud_shape"),
+        (cloud(SHORT, bytes(25), 1, 12, height=2, row_step=0), "cloud_shape"),
         (cloud(SHORT, bytes(24), 2, MAX, row_step=MAX), "cloud_shape"),
         (cloud(SHORT, bytes(24), MAX, MAX, height=MAX, row_step=MAX), "cloud_too_large"),
         (cloud(SHORT, bytes(24), 2**16, 12, height=2**16, row_step=0), "cloud_too_large"),  # 0 in 32 bits

@@ -392,8 +392,7 @@ def frame_of(
         DecodeError: `cloud_shape`, `cloud_fields`, `cloud_too_large`, `cloud_empty`, `cloud_time`,
         `cloud_time_ambiguous`, `cloud_concatenated`.
     """
-    _check_layout(message, limits)
-    message = points_of_source(message, source)
+    message = points_of_source(_checked_layout(message, limits), source)
     by_name = {field.name: field for field in reversed(message.fields)}  # the first field of a name counts
     with np.errstate(over="ignore", invalid="ignore"):  # values beyond float32 become infinite and are dropped
         xyz_m = _positions(message, by_name)
@@ -451,23 +450,33 @@ def message_of(frame: LidarFrame) -> PointCloud2:
     )
 
 
-def _check_layout(message: PointCloud2, limits: LimitsConfig) -> None:
-    """Checks the sizes, in Python integers, which do not overflow."""
+def row_step_of(message: PointCloud2) -> int:
+    """Bytes from row to row. Drivers of one row leave `row_step` out, and others state the whole cloud there: where it
+    does not fit, and the data is as long as rows without padding, these are assumed."""
+    row = message.width * message.point_step
+    fits = row <= message.row_step <= (message.data.size - row) // max(message.height - 1, 1)
+    return row if message.height == 1 or (not fits and message.data.size == message.height * row) else message.row_step
+
+
+def _checked_layout(message: PointCloud2, limits: LimitsConfig) -> PointCloud2:
+    """The message with its `row_step`, whose sizes are checked in Python integers, which do not overflow."""
     count = message.width * message.height
     if count > limits.max_points:
         raise DecodeError(Refusal.CLOUD_TOO_LARGE, f"{count} points; limits.max_points is {limits.max_points}")
     if count == 0:
         raise DecodeError(Refusal.CLOUD_EMPTY, "the cloud has no point")
+    row_step = row_step_of(message)
     if (
         message.point_step == 0
-        or message.row_step < message.width * message.point_step
-        or message.data.size < (message.height - 1) * message.row_step + message.width * message.point_step
+        or row_step < message.width * message.point_step
+        or message.data.size < (message.height - 1) * row_step + message.width * message.point_step
     ):
         raise DecodeError(
             Refusal.CLOUD_SHAPE,
             f"{message.height}×{message.width} points of {message.point_step} bytes, rows {message.row_step} apart, "
             f"do not fit into {message.data.size} bytes",
         )
+    return message if row_step == message.row_step else replace(message, row_step=row_step)
 
 
 def _positions(message: PointCloud2, by_name: Mapping[str, PointField]) -> NDArray[np.float32]:

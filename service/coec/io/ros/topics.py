@@ -22,7 +22,7 @@ from coec.io.frame_validation import Refusal
 from coec.io.ros import message_encoding, messages
 from coec.io.ros.camera_info import info_topic
 from coec.io.ros.message_encoding import PlacedFrame
-from coec.io.ros.point_clouds import SINCE_S, UNTIL_S
+from coec.io.ros.point_clouds import SINCE_S, UNTIL_S, row_step_of
 from coec.io.ros.wire_format import Qos
 from coec.schemas.keys import TF_STATIC
 
@@ -267,7 +267,7 @@ def _cloud(data: bytes, shift_ns: int) -> bytes:
                 dtype=">f8" if message.is_bigendian else "<f8",
                 buffer=points,
                 offset=field.offset,
-                strides=(message.row_step, message.point_step),
+                strides=(row_step_of(message), message.point_step),
             )
         except (TypeError, ValueError) as error:
             raise DecodeError(Refusal.CLOUD_SHAPE, "the points do not fit into the message") from error
