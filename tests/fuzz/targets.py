@@ -367,7 +367,11 @@ def _nominal(data: bytes, folder: Path) -> None:
                 assert np.isfinite(project_point(camera, 0.1, -0.1, 1.0)[:2]).all()
     elif kind == b"t":
         transforms = StaticTransforms()
-        transforms.add(decode_static_transforms(body))
+        decoded = decode_static_transforms(body)
+        transforms.refuse(decoded.refused)
+        transforms.add(decoded.joints)
+        transforms.add(decoded.joints)
+        transforms.changes("camera", "lidar")
         detected = transforms.transform("camera", "lidar")
         transforms.doubts("camera", "lidar")
         assert detected is None or np.isfinite(detected).all()

@@ -66,6 +66,14 @@ def project(camera: Camera, p_camera: NDArray[np.floating]) -> tuple[NDArray[np.
     return uv_px, valid
 
 
+def share_in_image(camera: Camera, T_camera_lidar: NDArray[np.float64], xyz_m: NDArray[np.floating]) -> float:
+    """Share of the points (N, 3) that lie in the image at a pose (4, 4)."""
+    p_camera: NDArray[np.float64] = xyz_m.astype(np.float64) @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
+    uv_px, valid = project(camera, p_camera)
+    inside = valid & in_image(camera, uv_px)
+    return float(inside.mean()) if len(inside) else 0.0
+
+
 def unproject(camera: Camera, uv_px: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Rays of pixels.
 

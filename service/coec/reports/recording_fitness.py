@@ -3,6 +3,7 @@
 The stamps of all frames are known without loading them; only a few frames, evenly chosen, are loaded.
 """
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
@@ -10,7 +11,6 @@ from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.monitor.check_verdict import MIN_PAIRS
@@ -23,12 +23,11 @@ from coec.calibration.types import (
     FramePair,
     LidarFrame,
     Reason,
-    Rig,
 )
 from coec.config import PairingConfig, WindowConfig
-from coec.geometry.cameras import in_image
+from coec.geometry.cameras import Camera, domain_angle_rad, project_point, unproject_point
 from coec.geometry.points import lengths
-from coec.geometry.projection import project
+from coec.geometry.projection import share_in_image
 from coec.io.recordings.recording_source import RecordingSource, evenly_spread, recognitions_of
 from coec.io.recordings.window_cutting import clock_separation_text, clocks_text
 
@@ -48,6 +47,14 @@ SMEARING_MPS = 1.0
 
 MOSTLY = 0.5
 """Below this share of pairs with ego-motion there is a remark."""
+
+OFF_MIDDLE = 0.3
+"""Distance of a principal point from the middle of the image, as a share of half the image, from which on it is of
+another image. Those of lenses lie within 0.1; cropped images differ by more."""
+
+NARROWEST_CIRCLE_RAD = math.radians(80.0)
+"""A lens whose image circle ends within the image sees at least so far from its axis. A model that ends before is a
+polynomial that turns back."""
 
 MANY_GAPS = 3.0
 """A gap between frames is long from this many median intervals on."""
@@ -155,6 +162,7 @@ def fitness_of(recording: RecordingSource) -> Fitness:
     sync_ms = np.array([(pair.camera.stamp_ns - pair.lidar.stamp_ns) / 1e6 for pair in pairs])
     ranges_m = np.concatenate([lengths(sweep.xyz_m) for sweep in sweeps] or [np.zeros(1, np.float32)])
     near, far = np.percentile(ranges_m[ranges_m > 0.0] if ranges_m.any() else ranges_m, [5, 95]).tolist()
+    in_view = [share_in_image(rig.camera, rig.T_camera_lidar_nominal, sweep.xyz_m) for sweep in sweeps]
     seen = Fitness(
         seconds=(stamps_ns[-1] - stamps_ns[0]) / NS_PER_S if stamps_ns else 0.0,
         camera=cadence(stamps_ns),
@@ -174,12 +182,17 @@ def fitness_of(recording: RecordingSource) -> Fitness:
         standing=standing,
         paired=len(pairs) / len(sampled) if sampled else 0.0,
         sync_ms=(float(np.median(sync_ms)), float(np.abs(sync_ms).max())) if len(sync_ms) else None,
-        in_view=float(np.median([in_view(sweep, rig) for sweep in sweeps])) if sweeps else 0.0,
+        in_view=float(
+            np.median([share_in_image(rig.camera, rig.T_camera_lidar_nominal, sweep.xyz_m) for sweep in sweeps])
+        )
+        if sweeps
+        else 0.0,
         not_finite=float(np.median([_not_finite(sweep) for sweep in sweeps])) if sweeps else 0.0,
         clocks=(clock_separation_text if pairs else clocks_text)(stamps_ns, recording.sweep_stamps_ns),
         remarks=(),
     )
     recognised = [Notice(one.level, one.code, one.text) for one in recognitions_of(recording, sweeps)]
+    recognised += lens_notices(rig.camera)
     return _with_remarks(seen, recognised)
 
 
@@ -238,15 +251,6 @@ def cadence(stamps_ns: Sequence[int]) -> Cadence:
     return Cadence(len(stamps_ns), 1.0 / median_s if median_s > 0.0 else 0.0, float(gaps_s.max()))
 
 
-def in_view(sweep: LidarFrame, rig: Rig) -> float:
-    """Share of a sweep's points that the nominal extrinsic puts into the image."""
-    T = rig.T_camera_lidar_nominal
-    p_camera: NDArray[np.float64] = sweep.xyz_m.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
-    uv_px, valid = project(rig.camera, p_camera)
-    inside = valid & in_image(rig.camera, uv_px)
-    return float(inside.mean()) if len(inside) else 0.0
-
-
 def passes(sweep: LidarFrame) -> int:
     """How often the times of a sweep's points run through, in the order in which the points are stored: one more than
     they begin anew; 0 without times."""
@@ -301,6 +305,38 @@ def _view(seen: Fitness) -> Notice | None:
         return None
     text = f"{seen.in_view:.1%} of the points lie in the image at the nominal extrinsic: is it from LiDAR to camera?"
     return Notice("fail" if seen.in_view == 0.0 else "warn", "little_in_view", text)
+
+
+def lens_notices(camera: Camera) -> list[Notice]:
+    """What is doubtful about a lens by itself: a principal point of an image of another size, and a distortion that
+    ends before the corners."""
+    width, height, cx, cy = camera.width, camera.height, camera.cx, camera.cy
+    notices = []
+    across, down = (2.0 * cx + 1.0) / width, (2.0 * cy + 1.0) / height
+    if max(abs(across - 1.0), abs(down - 1.0)) > OFF_MIDDLE:
+        of_other = abs(across - down) < 0.1 * across
+        cause = (
+            f"it is that of an image {across:.2g} times as large: scale fx, fy, cx and cy, or correct the binning"
+            if of_other
+            else "check cx and cy, and whether the images are cropped"
+        )
+        text = (
+            f"The principal point ({cx:.0f}, {cy:.0f}) is far from the middle of the {width} x {height} image: {cause}."
+        )
+        notices.append(Notice("warn", "principal_point", text))
+    corners = [(u, v) for u in (0.0, width - 1.0) for v in (0.0, height - 1.0)]
+    limit_rad = domain_angle_rad(camera)
+    if limit_rad < NARROWEST_CIRCLE_RAD and not all(unproject_point(camera, u, v)[3] for u, v in corners):
+        inside_rad = limit_rad * (1.0 - 1e-6)
+        end_px = project_point(camera, math.sin(inside_rad), 0.0, math.cos(inside_rad))[0] - cx
+        corner_px = max(math.hypot(u - cx, v - cy) for u, v in corners)
+        text = (
+            f"The lens model ends {math.degrees(limit_rad):.1f} deg from the axis, {end_px:.0f} px from the principal "
+            f"point; the corners are {corner_px:.0f} px away. It was fitted to the inner part of the image: calibrate "
+            "the lens with points up to the corners."
+        )
+        notices.append(Notice("warn", "lens_ends", text))
+    return notices
 
 
 def _not_finite(sweep: LidarFrame) -> float:

@@ -247,7 +247,7 @@ class _Search:
         names = f"{_named(target)} and {_named(source)}"
         if T_target_source is None:
             there = _listed(self._transforms.frames)
-            text = f"{TF_STATIC} does not connect {names} (for {place}): {there}."
+            text = f"{TF_STATIC} does not connect {names} (for {place}): {there}.{_left_out(self._transforms)}"
             raise _MissingError(Reason("tf_static", text))
         doubts = self._transforms.doubts(target, source)
         if doubts:
@@ -315,6 +315,13 @@ def _listed(frames: Iterable[str]) -> str:
         return "it names no frames yet"
     more = f" and {len(known) - SHOWN_FRAMES} more" if len(known) > SHOWN_FRAMES else ""
     return f"there are {', '.join(known[:SHOWN_FRAMES])}{more}"
+
+
+def _left_out(transforms: StaticTransforms) -> str:
+    if not transforms.refused:
+        return ""
+    listed = ", ".join(f"{_named(parent)} -> {_named(child)}" for parent, child in transforms.refused)
+    return f" Invalid transforms were left out: {listed}."
 
 
 _log = logging.getLogger(__name__)

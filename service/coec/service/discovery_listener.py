@@ -200,12 +200,20 @@ class DiscoveryListener:
             each.refused = outcome
 
     def _take_transforms(self, sample: InputSample) -> None:
-        cause = _attempt(lambda: self._transforms.add(decode_static_transforms(_payload(sample, messages.TF))))
-        if cause is not None:
+        refused: list[str] = []
+
+        def add() -> None:
+            decoded = decode_static_transforms(_payload(sample, messages.TF))
+            refused.extend(error.reason for error in decoded.refused.values())
+            self._transforms.refuse(decoded.refused)
+            self._transforms.add(decoded.joints)
+
+        cause = _attempt(add)
+        for lost in (*refused, *([] if cause is None else [cause])):
             with self._condition:
-                self._transforms_lost[cause] += 1
-                count = self._transforms_lost[cause]
-            _log_loss(TRANSFORMS, cause, count)
+                self._transforms_lost[lost] += 1
+                count = self._transforms_lost[lost]
+            _log_loss(TRANSFORMS, lost, count)
 
     def _take_latest(self, each: _PendingPair, stream: str, sample: InputSample) -> None:
         if each.built and stream != INFO:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,6 +14,7 @@ from coec.errors import DecodeError
 from coec.geometry import se3
 from coec.io.ros.transforms import (
     MAX_MESSAGE_BYTES,
+    MAX_REFUSED,
     MAX_STATIC_TRANSFORMS,
     StaticTransform,
     StaticTransforms,
@@ -39,7 +42,7 @@ def tree(*joints: tuple[str, str, NDArray[np.float64]]) -> StaticTransforms:
 
 def test_a_transform_is_the_pose_of_the_child_in_its_parent() -> None:
     half = np.sqrt(0.5)
-    (joint,) = decode_static_transforms(packed(("/base", "camera", (1.0, 2.0, 3.0), (0.0, 0.0, half, half))))
+    (joint,) = decode_static_transforms(packed(("/base", "camera", (1.0, 2.0, 3.0), (0.0, 0.0, half, half)))).joints
     assert (joint.parent, joint.child) == ("base", "camera")
     np.testing.assert_allclose(joint.T_parent_child @ [1.0, 0.0, 0.0, 1.0], [1.0, 3.0, 3.0, 1.0], atol=1e-15)
 
@@ -106,19 +109,49 @@ UNIT, ZERO = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
         (packed(claimed=1000), "message_malformed"),
         (packed(claimed=2**32 - 1), "transforms_too_many"),
         (b"\x00\x01\x00\x00" + bytes(MAX_MESSAGE_BYTES), "message_too_large"),
-        (packed(("a", "b", ZERO, (0.0, 0.0, 0.0, 0.0))), "transform_invalid"),
-        (packed(("a", "b", ZERO, (float("nan"), 0.0, 0.0, 1.0))), "transform_invalid"),
-        (packed(("a", "b", (float("inf"), 0.0, 0.0), UNIT)), "transform_invalid"),
-        (packed(("a", "b", (1e12, 0.0, 0.0), UNIT)), "transform_invalid"),
-        (packed(("a", "/a", ZERO, UNIT)), "transform_invalid"),
-        (packed(("", "b", ZERO, UNIT)), "frame_id_invalid"),
-        (packed(("a", "b" * 129, ZERO, UNIT)), "frame_id_invalid"),
     ],
 )
 def test_what_is_no_transform_is_refused(payload: bytes, cause: str) -> None:
     with pytest.raises(DecodeError) as refused:
         decode_static_transforms(payload)
     assert refused.value.reason == cause
+
+
+@pytest.mark.parametrize(
+    ("invalid", "cause"),
+    [
+        (("a", "b", ZERO, (0.0, 0.0, 0.0, 0.0)), "transform_invalid"),
+        (("a", "b", ZERO, (float("nan"), 0.0, 0.0, 1.0)), "transform_invalid"),
+        (("a", "b", (float("inf"), 0.0, 0.0), UNIT), "transform_invalid"),
+        (("a", "b", (1e12, 0.0, 0.0), UNIT), "transform_invalid"),
+        (("a", "/a", ZERO, UNIT), "transform_invalid"),
+        (("", "b", ZERO, UNIT), "frame_id_invalid"),
+        (("a", "b" * 129, ZERO, UNIT), "frame_id_invalid"),
+    ],
+)
+def test_an_invalid_transform_costs_no_other(invalid: tuple[Any, ...], cause: str) -> None:
+    decoded = decode_static_transforms(packed(("base", "lidar", ZERO, UNIT), invalid, ("base", "camera", ZERO, UNIT)))
+    assert [joint.child for joint in decoded.joints] == ["lidar", "camera"]
+    ((names, error),) = decoded.refused.items()
+    assert error.reason == cause
+    assert all(len(name) <= 128 for name in names)
+
+
+def test_the_refused_transforms_that_are_remembered_are_few() -> None:
+    transforms = StaticTransforms()
+    for number in range(1000):
+        transforms.refuse({("a", str(number)): DecodeError("transform_invalid", "not rigid")})
+    assert len(transforms.refused) == MAX_REFUSED
+
+
+def test_values_that_contradict_each_other_are_named_where_they_lie_on_the_way() -> None:
+    transforms = tree(("base", "lidar", np.eye(4)), ("base", "camera", T), ("base", "wheel", np.eye(4)))
+    transforms.add((StaticTransform("base", "wheel", T), StaticTransform("base", "camera", T)))
+    assert transforms.changes("camera", "lidar") == ()
+    moved = se3.transform_from(se3.rotation_exp(np.array([0.0, 0.0, np.radians(2.0)])), np.array([0.0, 0.5, 0.0]))
+    transforms.add((StaticTransform("base", "lidar", moved),))
+    (sentence,) = transforms.changes("camera", "lidar")
+    assert "'base' -> 'lidar' comes with several values, 2.00 deg and 0.500 m apart; the last one holds" in sentence
 
 
 def test_a_flood_of_frames_ends_and_leaves_what_was_known() -> None:

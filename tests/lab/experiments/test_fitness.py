@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Rig
 from coec.geometry.cameras import build
+from coec.geometry.projection import share_in_image
 from coec.io.recordings.recording_source import FramewiseRecording, RecordedFrame
-from coec.reports.recording_fitness import cadence, fitness_of, in_view, passes
+from coec.reports.recording_fitness import cadence, fitness_of, lens_notices, passes
 
 FORWARD = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 RIG = Rig(
@@ -149,8 +150,9 @@ def test_an_extrinsic_the_wrong_way_round_is_reported() -> None:
 def test_points_at_the_border_of_the_image_are_in_view() -> None:
     at = np.array([[20.0, 0.0, 0.0]]) + np.array([[0.0, 19.9, 0.0]])
     sweep = LidarFrame(0, "lidar", at.astype(np.float32))
-    assert in_view(sweep, RIG) == 1.0
-    assert in_view(replace(sweep, xyz_m=(at + np.array([[0.0, 0.2, 0.0]])).astype(np.float32)), RIG) == 0.0
+    T = RIG.T_camera_lidar_nominal
+    assert share_in_image(RIG.camera, T, sweep.xyz_m) == 1.0
+    assert share_in_image(RIG.camera, T, at + np.array([[0.0, 0.2, 0.0]])) == 0.0
 
 
 def test_motion_of_another_clock_is_reported() -> None:
@@ -158,3 +160,31 @@ def test_motion_of_another_clock_is_reported() -> None:
     later = tuple(replace(motion, stamp_ns=motion.stamp_ns + 37_000 * MS) for motion in recording.motions)
     assert codes(replace(recording, motions=later))["motion_apart"] == "warn"
     assert "motion_apart" not in codes(recording)
+
+
+@pytest.mark.parametrize(
+    ("intrinsics", "code", "text"),
+    [
+        ({}, None, ""),
+        ({"cx": 339.5, "cy": 180.5}, None, ""),
+        ({"cx": 639.0, "cy": 399.0}, "principal_point", "of an image 2 times as large"),
+        ({"cx": 160.0, "cy": 100.0}, "principal_point", "of an image 0.5 times as large"),
+        ({"cx": 319.5, "cy": 20.0}, "principal_point", "check cx and cy"),
+    ],
+)
+def test_a_principal_point_of_another_image_is_named(intrinsics: dict[str, float], code: str | None, text: str) -> None:
+    given = {"width": 640, "height": 400, "fx": 320.0, "fy": 320.0, "cx": 319.5, "cy": 199.5, **intrinsics}
+    notices = lens_notices(build("pinhole", **given))
+    assert [notice.code for notice in notices] == ([] if code is None else [code])
+    assert all(text in notice.text for notice in notices)
+
+
+def test_a_polynomial_that_turns_back_before_the_corners_is_named() -> None:
+    given = {"width": 640, "height": 400, "fx": 320.0, "fy": 320.0, "cx": 319.5, "cy": 199.5}
+    wild = build("kannala_brandt", **given, k1=-1.152516, k2=2.913204, k3=-2.482336, k4=0.178503)
+    (notice,) = lens_notices(wild)
+    assert notice.code == "lens_ends"
+    assert "48.7 deg from the axis, 218 px" in notice.text
+    # A fisheye whose image circle ends within the image is no such polynomial.
+    circle = build("kannala_brandt", **{**given, "fx": 100.0, "fy": 100.0}, k1=0.0, k2=0.0, k3=0.0, k4=0.0)
+    assert lens_notices(circle) == []

@@ -10,13 +10,14 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from coec.calibration.frames.lidar_origin import NO_SCAN_LINES, ApparentOrigin, SeveralOrigins
+from coec.calibration.frames.lidar_origin import NO_SCAN_LINES, ApparentOrigin, SeveralOrigins, from_origin
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Recognition, Rig
 from coec.config import CalibrationConfig
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.io.mcap.window_reader import is_window, read_window
 from coec.io.recordings import bag_index, bag_recognition, recording_source
 from coec.io.recordings.bag_recognition import Sweep
+from coec.io.recordings.bag_rig import PairMessages, lidar_frame_of, rig_of_bag
 from coec.io.recordings.bag_storage import BagReader, BagStorage, open_storage
 from coec.io.recordings.cloud_files import measured_from
 from coec.io.recordings.recording_source import evenly_spread
@@ -40,6 +41,7 @@ KEYS = (
     "points",
     "odometry",
     "intrinsics",
+    "camera_frame",
     "lidar_frame",
     "moving",
     "time",
@@ -49,15 +51,16 @@ KEYS = (
 
 
 def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSource:
-    """`BAG[?camera=/TOPIC][&points=/TOPIC][&odometry=/TOPIC][&intrinsics=FILE or /TOPIC][&lidar_frame=NAME]
-    [&moving=PARENT,CHILD][&time=FIELD,UNIT[,BASE]][&lidar_source=N][&odometry_frame=NAME]`, and the keys of
-    `bag_recognition.Readings`.
+    """`BAG[?camera=/TOPIC][&points=/TOPIC][&odometry=/TOPIC][&intrinsics=FILE or /TOPIC][&camera_frame=NAME]
+    [&lidar_frame=NAME][&moving=PARENT,CHILD][&time=FIELD,UNIT[,BASE]][&lidar_source=N][&odometry_frame=NAME]`, and the
+    keys of `bag_recognition.Readings`.
 
     Without a query, a recorded window is opened as such. In any other bag:
 
     - Topics are found by their type if there is only one of that type.
     - Intrinsics come from the `CameraInfo` of the camera's frame (or of the topic `intrinsics`), or from a YAML file.
-    - The extrinsic comes from that file, else from `/tf_static`, over any number of joints.
+    - The extrinsic comes from that file, else from `/tf_static`, over any number of joints. `camera_frame` names the
+      camera's frame if its images name another one, or the images of one camera if several publish on the topic.
     - If a driver gives points in another frame than the LiDAR's (`base_link`), `lidar_frame` names the LiDAR's frame,
       and the points are moved back to it along `/tf_static`.
     - If no topic gives a velocity, the motion comes from the transforms of `/tf` between the frames that `moving` names
@@ -83,6 +86,8 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
     index = bag_index.build_index(storage, clouds)
     camera_topic = index.topic(bag_index.IMAGE_TYPES, query.get("camera"), "camera")
     lidar_topic = index.topic(bag_index.CLOUD_TYPES, query.get("points"), "points")
+    index.require_one_frame(camera_topic, query.get("camera_frame"), "camera_frame")
+    index.require_one_frame(lidar_topic, query.get("lidar_frame"), "lidar_frame")
     with storage.open() as reader:
         streams, of_twists = _streams(
             index, reader, camera_topic, lidar_topic, (frames, query.get("odometry")), readings
@@ -91,20 +96,24 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
         cloud = _load(storage, reader, streams.lidar[0], clouds)
         motions = [*streams.moved[:1], *(_load(storage, reader, place, clouds) for place in streams.motion[:1])]
         motion = motions[0] if motions else None
-    if not isinstance(camera, CameraFrame) or not isinstance(motion, EgoMotion | None):
+        of_transforms = index.connect(query.get("camera_frame", camera.frame_id), cloud.frame_id, reader)
+    if (
+        not isinstance(camera, CameraFrame)
+        or not isinstance(cloud, LidarFrame)
+        or not isinstance(motion, EgoMotion | None)
+    ):
         raise SourceError(f"{spec.path}: {camera_topic} holds no images, or no motion on the topic named for it")
-    lidar_frame = query.get("lidar_frame", cloud.frame_id)
-    T_cloud_lidar = index.transform(cloud.frame_id, lidar_frame)
-    if T_cloud_lidar is None:
-        raise SourceError(f"{spec.path}: /tf_static does not connect {cloud.frame_id!r} and {lidar_frame!r}")
+    lidar_frame, T_cloud_lidar = lidar_frame_of(index, cloud, query.get("lidar_frame"))
     motion, unconnected = _connected(index, lidar_frame, motion, query.get("odometry_frame"))
     if unconnected is not None:
         streams = replace(streams, motion=[], moved=())
-    rig = bag_index.rig_of_bag(index, query.get("intrinsics"), camera_topic, camera, lidar_frame, motion)
-    name = f"{spec.path.name}{camera_topic}"
-    recognised = tuple(one for one in (of_twists, unconnected) if one is not None)
+    sweep = from_origin(cloud, T_cloud_lidar, lidar_frame)
+    rig, of_rig = rig_of_bag(
+        index,
+        PairMessages(camera_topic, camera, sweep, motion, query.get("intrinsics"), query.get("camera_frame")),
+    )
     recording = BagRecording(
-        name,
+        f"{spec.path.name}{camera_topic}",
         rig,
         rig.T_camera_lidar_nominal,
         storage,
@@ -113,7 +122,7 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
         clouds,
         readings,
         cloud.frame_id,
-        recognised,
+        (*of_transforms, *of_rig, *(one for one in (of_twists, unconnected) if one is not None)),
     )
     return recording.recognised()
 

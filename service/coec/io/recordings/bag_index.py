@@ -7,26 +7,31 @@ time is not used.
 
 from __future__ import annotations
 
-import re
 import struct
+import sys
+from collections import Counter
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import ValidationError
 
-from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
-from coec.config import CameraIntrinsics, FilePath, LimitsConfig, Matrix4x4, PointTimeConfig, describe
-from coec.config.pose_forms import with_direction
-from coec.errors import ConfigError, DecodeError, SourceError, UsageError
-from coec.io.intrinsics_files import load_camera_document, with_camera
+from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Recognition
+from coec.config import LimitsConfig, PointTimeConfig, describe
+from coec.errors import DecodeError, SourceError, UsageError
 from coec.io.recordings.bag_storage import BagMessage, BagReader, BagStorage
-from coec.io.rig_files import camera_of, load_mask, rigid_matrix
 from coec.io.ros import camera_info, message_decoding, messages
-from coec.io.ros.transforms import MovingFrame, StaticTransforms, bare, decode_static_transforms, frames_in
-from coec.io.user_files import expand_home
+from coec.io.ros.transforms import (
+    MovingFrame,
+    StaticTransform,
+    StaticTransforms,
+    bare,
+    decode_static_transforms,
+    frames_in,
+)
 from coec.schemas.keys import TF_STATIC
 
 
@@ -76,17 +81,25 @@ ROTATION_TYPES = (messages.IMU,)
 
 T = TypeVar("T")
 
+MAX_TF_MESSAGES: Final = 10_000
+"""Most messages of transforms of a topic that are looked at for constant ones."""
+
+UNMOVED: Final = 1e-6
+"""Entries of a pose that change by less are constant."""
+
 _HEADER = {1: struct.Struct("<iI"), 0: struct.Struct(">iI")}
 """`std_msgs/Header.stamp` (sec, nanosec) by the byte order of the message. Every type above begins with it."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class MessageLocation:
-    """Where a message lies. Places are ordered by the stamp of the header; equal stamps by the order in the bag."""
+    """Where a message lies, and the frame that its header names. Places are ordered by the stamp of the header; equal
+    stamps by the order in the bag."""
 
     stamp_ns: int
     at: tuple[int, ...]
     type_name: str = field(compare=False)
+    frame_id: str = field(default="", compare=False)
 
 
 @dataclass(slots=True)
@@ -100,6 +113,11 @@ class TopicStream:
         """The places in the order of their stamps."""
         return sorted(self.locations)
 
+    @property
+    def frames(self) -> Counter[str]:
+        """How many messages name each frame."""
+        return Counter(bare(location.frame_id) for location in self.locations)
+
 
 @dataclass(slots=True)
 class BagIndex:
@@ -108,7 +126,7 @@ class BagIndex:
     Attributes:
         clouds: how clouds are read.
         streams: frames by topic.
-        infos: the first camera info of each topic.
+        infos: the camera infos of each topic.
         transforms: all static transforms.
         transforms_at: places of the messages of all other transforms, by topic, in the order in the bag.
     """
@@ -116,7 +134,7 @@ class BagIndex:
     path: Path
     clouds: CloudDecoder
     streams: dict[str, TopicStream] = field(default_factory=dict)
-    infos: dict[str, camera_info.CameraInfoContent] = field(default_factory=dict)
+    infos: dict[str, camera_info.CameraInfos] = field(default_factory=dict)
     transforms: StaticTransforms = field(default_factory=StaticTransforms)
     transforms_at: dict[str, list[tuple[int, ...]]] = field(default_factory=dict)
 
@@ -154,10 +172,59 @@ class BagIndex:
         Raises:
             SourceError: they connect the frames in ways that contradict each other.
         """
+        if bare(target) == bare(source):
+            return np.eye(4)
         doubts = self.transforms.doubts(target, source)
         if doubts:
             raise SourceError(f"{self.path}: /tf_static is no tree: {'; '.join(doubts)}")
         return self.transforms.transform(target, source)
+
+    def require_one_frame(self, topic: str, requested: str | None, key: str) -> None:
+        """Leaves the messages of one frame on a topic: the one that was asked for by `key`, if it names one of several.
+
+        Raises:
+            SourceError: the messages name several frames, and none of them was asked for.
+        """
+        stream = self.streams[topic]
+        frames = stream.frames
+        if len(frames) < 2:
+            return
+        if requested is None or bare(requested) not in frames:
+            counts = ", ".join(f"{frame!a} ({count})" for frame, count in frames.most_common(LISTED))
+            raise SourceError(
+                f"{self.path}: the messages on {topic} name {len(frames)} frames: {counts}. Two sensors publish on it: "
+                f"choose one with ?{key}=NAME"
+            )
+        stream.locations = [location for location in stream.locations if bare(location.frame_id) == bare(requested)]
+
+    def connect(self, target: str, source: str, reader: BagReader) -> tuple[Recognition, ...]:
+        """If the static transforms do not connect two frames, adds those of other topics (`/tf`) that never change,
+        and returns what to tell of that."""
+        if self.transforms.transform(target, source) is not None:
+            return ()
+        self._add_constant_transforms(reader)
+        if self.transforms.transform(target, source) is None:
+            return ()
+        topics = " and ".join(self.transforms_at)
+        text = f"/tf_static does not connect {target!a} and {source!a}: transforms on {topics} do, and never change."
+        return (Recognition("constant_transforms", text, "warn"),)
+
+    def _add_constant_transforms(self, reader: BagReader) -> None:
+        constant: dict[tuple[str, str], StaticTransform | None] = {}
+        for topic in self.transforms_at:
+            for place in self.transforms_at[topic][:MAX_TF_MESSAGES]:
+                try:
+                    joints = decode_static_transforms(reader.read(place)).joints
+                except DecodeError:
+                    continue
+                for joint in joints:
+                    known = constant.setdefault((joint.parent, joint.child), joint)
+                    if known is not None and not np.allclose(known.T_parent_child, joint.T_parent_child, 0.0, UNMOVED):
+                        constant[joint.parent, joint.child] = None
+        known_frames = set(self.transforms.frames)
+        fresh = (joint for joint in constant.values() if joint is not None)
+        with suppress(DecodeError):
+            self.transforms.add(tuple(j for j in fresh if not {j.parent, j.child} <= known_frames))
 
     def add(self, entry: BagMessage) -> None:
         """Notes a message.
@@ -173,11 +240,14 @@ class BagIndex:
                 raise SourceError(f"{self.path}: a message on {entry.topic} has no valid header")
             if stamp_ns == 0 and name in CLOUD_TYPES:
                 stamp_ns = self._stamp_of_points(entry)
-            stream.locations.append(MessageLocation(stamp_ns, entry.place, name))
-        elif name == messages.CAMERA_INFO and entry.topic not in self.infos:
-            self.infos[entry.topic] = self._decoded(entry, camera_info.decode_info)
+            frame_id = sys.intern(messages.header_frame_id(entry.data))
+            stream.locations.append(MessageLocation(stamp_ns, entry.place, name, frame_id))
+        elif name == messages.CAMERA_INFO:
+            self._decoded(entry, self.infos.setdefault(entry.topic, camera_info.CameraInfos()).add)
         elif name == messages.TF and entry.topic == TF_STATIC:
-            self._decoded(entry, lambda data: self.transforms.add(decode_static_transforms(data)))
+            decoded = self._decoded(entry, decode_static_transforms)
+            self.transforms.refuse(decoded.refused)
+            self._decoded(entry, lambda _: self.transforms.add(decoded.joints))
         elif name == messages.TF:
             self.transforms_at.setdefault(entry.topic, []).append(entry.place)
 
@@ -216,110 +286,11 @@ def _header_stamp_ns(data: bytes) -> int | None:
     return seconds * 1_000_000_000 + nanoseconds if seconds >= 0 and nanoseconds < 1_000_000_000 else None
 
 
-class IntrinsicsFile(BaseModel):
-    """`intrinsics=FILE`: the head of a `dataset.yaml`, for bags without camera info or without a transform."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    camera: CameraIntrinsics
-    T_camera_lidar: Matrix4x4 | None = None
-    mask: FilePath | None = None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _with_direction(cls, document: Any) -> Any:
-        return with_direction(document)
-
-
-def rig_of_bag(
-    index: BagIndex,
-    intrinsics: str | None,
-    image_topic: str,
-    image: CameraFrame,
-    lidar_frame_id: str,
-    motion: EgoMotion | None,
-) -> Rig:
-    """The rig of a pair. Intrinsics come from the `CameraInfo` of the topic `intrinsics`, else beside the images, else
-    of the camera's frame; or from the YAML file `intrinsics`. The extrinsic comes from that file, else from
-    `/tf_static`.
-
-    Raises:
-        SourceError: there are no intrinsics, several, or those of another image size; or there is no extrinsic.
-    """
-    camera_frame, lidar_frame = bare(image.frame_id), bare(lidar_frame_id)
-    mask = None
-    T_camera_lidar = index.transform(camera_frame, lidar_frame)
-    try:
-        if intrinsics is None or intrinsics in index.infos:
-            info = _info(index, intrinsics, camera_frame, image_topic)
-            camera = camera_of(_lens(index, info, image_topic).intrinsics)
-        else:
-            path = expand_home(intrinsics)
-            content, name = load_camera_document(path)
-            size, rectified = (image.image.width, image.image.height), camera_info.is_rectified(image_topic)
-            document = IntrinsicsFile.model_validate(with_camera(content, path, name, rectified=rectified, size=size))
-            camera = camera_of(document.camera)
-            if document.T_camera_lidar is not None:
-                T_camera_lidar = rigid_matrix(document.T_camera_lidar, "T_camera_lidar")
-            if document.mask is not None:
-                mask = load_mask(path.parent / document.mask, camera)
-    except ValidationError as error:
-        raise SourceError(f"{intrinsics}: {describe(error)}") from error
-    except (ConfigError, ValueError) as error:
-        raise SourceError(f"intrinsics of {index.path}: {error}") from error
-    if T_camera_lidar is None:
-        raise SourceError(
-            f"{index.path}: /tf_static does not connect {camera_frame!r} and {lidar_frame!r}; "
-            "give ?intrinsics=FILE with `camera:` (which may name a camera_info.yaml) and `T_camera_lidar:` as in a "
-            "dataset.yaml"
-        )
-    if (image.image.width, image.image.height) != (camera.width, camera.height):
-        raise SourceError(
-            f"{index.path}: images are {image.image.width} x {image.image.height} px, "
-            f"the intrinsics are for {camera.width} x {camera.height} px"
-        )
-    T_lidar_ego = index.transform(lidar_frame, motion.frame_id) if motion else None
-    return Rig(
-        pair=re.sub(r"[^A-Za-z0-9_.-]", "_", index.path.stem)[:64],
-        camera=camera,
-        camera_frame=image.frame_id,
-        lidar_frame=lidar_frame_id,
-        T_camera_lidar_nominal=T_camera_lidar,
-        T_lidar_ego=np.eye(4) if T_lidar_ego is None else T_lidar_ego,
-        mask=mask,
-    )
-
-
-def _lens(index: BagIndex, info: camera_info.CameraInfoContent, image_topic: str) -> camera_info.CameraInfoIntrinsics:
-    try:
-        return camera_info.intrinsics_of_info(info, rectified=camera_info.is_rectified(image_topic))
-    except SourceError as error:
-        raise SourceError(f"the camera info of {index.path}: {error}; give ?intrinsics=FILE") from error
-
-
-def _info(index: BagIndex, requested: str | None, camera_frame: str, image_topic: str) -> camera_info.CameraInfoContent:
-    """The camera info that was asked for, else the one beside the images, of the camera's frame, or the only one."""
-    if requested is not None:
-        return index.infos[requested]
-    of_images = index.infos.get(camera_info.info_topic(image_topic))
-    if of_images is not None:
-        return of_images
-    matching = [info for info in index.infos.values() if bare(info.frame_id) == camera_frame]
-    candidates = matching or list(index.infos.values())
-    if len(candidates) != 1:
-        topics = ", ".join(index.infos) or "none"
-        raise SourceError(
-            f"{index.path}: {len(candidates)} camera infos fit; "
-            f"name one with ?intrinsics=/TOPIC, or give ?intrinsics=FILE; there: {topics}"
-        )
-    return candidates[0]
-
-
 VEHICLE: Final = ("odom", "base_link")
 """The frame in which a vehicle moves and the vehicle's own frame, as REP 105 names them."""
 
-_LISTED: Final = 12
-"""How many joints an error lists."""
+LISTED: Final = 12
+"""How many joints or frames an error lists."""
 
 
 def motion_topic(index: BagIndex, reader: BagReader, frames: tuple[str, str], requested: str | None) -> str | None:
@@ -353,8 +324,8 @@ def motions_of_transforms(
     motions = _motions(index, reader, topic, frames)
     if not motions:
         there = sorted(_joints(index, reader, topic))
-        joints_text = ", ".join(f"{parent},{child}" for parent, child in there[:_LISTED])
-        more = ", ..." if len(there) > _LISTED else ""
+        joints_text = ", ".join(f"{parent},{child}" for parent, child in there[:LISTED])
+        more = ", ..." if len(there) > LISTED else ""
         raise SourceError(
             f"{index.path}: {topic} does not say how {frames[1]!a} moves in {frames[0]!a}; name the frames with "
             f"?moving=PARENT,CHILD; there: {joints_text or 'none'}{more}"

@@ -190,6 +190,7 @@ FORMS = """accepted forms of a source:
   FILE.mcap                                     a recorded window
   BAG?camera=/TOPIC&points=/TOPIC&...           any ROS 2 bag: FILE.mcap, FILE.db3 or rosbag2's folder (topics are found
                                                 by type where they are unique; lidar_frame=NAME for clouds in another,
+                                                camera_frame=NAME for images that name another,
                                                 moving=PARENT,CHILD for motion on /tf, time=FIELD,UNIT[,BASE],
                                                 lidar_source=N for one LiDAR of a cloud of several; rings=,
                                                 compensated=, clouds_per_sweep=, motion=, odometry_frame=,

@@ -5,14 +5,16 @@ to the rectified one (the message's definition). A lens of an unknown model, or 
 refused with a reason instead of guessing.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 from pydantic import ValidationError
 from rosbags.typesys.stores import ros2_humble as ros
 
+from coec.calibration.types import Recognition
 from coec.config import CameraIntrinsics, describe
 from coec.errors import DecodeError, SourceError
 from coec.geometry import cameras
@@ -62,10 +64,82 @@ class CameraInfoContent:
 
 @dataclass(frozen=True, slots=True)
 class CameraInfoIntrinsics:
-    """Intrinsics, and a short text that says which of the message's numbers they come from."""
+    """Intrinsics, a short text that says which of the message's numbers they come from, and whether these were adapted
+    to a part of the image, or to a binned one."""
 
     intrinsics: CameraIntrinsics
     source: str
+    is_adapted: bool = False
+
+
+MAX_CONTENTS: Final = 64
+"""Most different contents of one topic that are kept. A driver that counts in a field of the message has more."""
+
+SAME_PX: Final = 1.0
+"""Matrices that differ by at most this are one lens, whose focus breathes."""
+
+
+class CameraInfos:
+    """The camera infos of one topic: their different contents, and how often each came."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.empty = 0
+        self._contents: Counter[CameraInfoContent] = Counter()
+        self._latest: tuple[bytes, CameraInfoContent] | None = None
+
+    def add(self, payload: bytes) -> None:
+        """Notes one more message in CDR.
+
+        Raises:
+            DecodeError: the reasons of `decode_info`.
+        """
+        # Most drivers send the same again and again, with another stamp.
+        body = payload[12:]
+        content = decode_info(payload) if self._latest is None or self._latest[0] != body else self._latest[1]
+        self._latest = body, content
+        self.count += 1
+        self.empty += content.k[0] == 0.0
+        if content in self._contents or len(self._contents) < MAX_CONTENTS:
+            self._contents[content] += 1
+
+    def frames(self) -> set[str]:
+        """The frames that the messages name."""
+        return {content.frame_id for content in self._contents}
+
+    def content(self, frames: Collection[str]) -> tuple[CameraInfoContent, tuple[Recognition, ...]]:
+        """The content that holds: of those that name one of the `frames`, if there are any, the most frequent one; and
+        what was left out.
+
+        Raises:
+            SourceError: the messages describe different lenses.
+        """
+        calibrated = {content: count for content, count in self._contents.items() if content.k[0] != 0.0}
+        if not calibrated:
+            return next(iter(self._contents)), ()
+        recognised = []
+        if self.empty:
+            text = f"{self.empty} of {self.count} CameraInfo are empty (K is zero) and are left out."
+            recognised.append(Recognition("camera_info_empty", text, "warn"))
+        own = {content: count for content, count in calibrated.items() if content.frame_id in frames} or calibrated
+        usual = max(own, key=own.__getitem__)
+        apart_px = max(np.abs(np.subtract(content.k, usual.k)).max() for content in own)
+        others = [c for c in own if replace(c, k=usual.k, p=usual.p, frame_id="") != replace(usual, frame_id="")]
+        if not apart_px <= SAME_PX or others:
+            other = max(own, key=lambda content: np.abs(np.subtract(content.k, usual.k)).max())
+            raise SourceError(
+                f"the CameraInfo changes on the way, between {_lens_text(usual)} and {_lens_text(other)}: let only one "
+                "camera publish on the topic, and keep zoom and resolution as they are"
+            )
+        if apart_px > 0.0:
+            text = f"The CameraInfo changes by up to {apart_px:.2f} px on the way; its most frequent content is used."
+            recognised.append(Recognition("camera_info_changes", text, "warn"))
+        return usual, tuple(recognised)
+
+
+def _lens_text(info: CameraInfoContent) -> str:
+    size = f"{info.size[0]} x {info.size[1]} px"
+    return f"fx {info.k[0]:.1f}, cx {info.k[2]:.1f}, {size} of {info.frame_id!a}"
 
 
 def decode_info(payload: bytes) -> CameraInfoContent:
@@ -193,7 +267,8 @@ def intrinsics_of_info(info: CameraInfoContent, *, rectified: bool) -> CameraInf
         if info.binning != (1, 1):
             camera = cameras.scaled(camera, 1.0 / info.binning[0], 1.0 / info.binning[1])
             source += f", binned {info.binning[0]} x {info.binning[1]}"
-        return CameraInfoIntrinsics(intrinsics_config(camera), source)
+        is_adapted = info.binning != (1, 1) or bool(cut_width or cut_height)
+        return CameraInfoIntrinsics(intrinsics_config(camera), source, is_adapted)
     except ValidationError as error:
         raise SourceError(describe(error)) from error
     except ValueError as error:

@@ -143,6 +143,18 @@ def check_header(payload: bytes) -> MessageCursor:
     return head
 
 
+def header_frame_id(payload: bytes) -> str:
+    """The frame id of the `std_msgs/Header` at the beginning of a message, without decoding the rest; empty if there is
+    none, or it is too long or no text."""
+    order, begin = _ORDERS.get(payload[1:2]), _ENCAPSULATION + _STAMP + 4
+    if order is None or len(payload) < begin:
+        return ""
+    (length,) = struct.unpack_from(f"{order}I", payload, begin - 4)
+    if length > _CHARACTER * MAX_FRAME_ID + 1:
+        return ""
+    return payload[begin : begin + length].rstrip(b"\0").decode(errors="replace")[:MAX_FRAME_ID]
+
+
 def check_cloud_fields(payload: bytes) -> None:
     """Checks the fields of a `PointCloud2`.
 

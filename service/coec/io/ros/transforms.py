@@ -11,8 +11,9 @@ error is of second order in dt at the middle between the two poses, and that mid
 """
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -96,6 +97,12 @@ def bare(frame_id: str) -> str:
 MAX_STATIC_TRANSFORMS: Final = 2048
 """Most joints that are kept; vehicles have some hundred."""
 
+MAX_REFUSED: Final = 16
+"""Most transforms that were left out and are remembered, so that a message can name them."""
+
+SAME: Final = 1e-4
+"""Values of one transform that differ by less (degrees, metres) are one value, written with other digits."""
+
 
 @dataclass(frozen=True, slots=True)
 class StaticTransform:
@@ -106,21 +113,43 @@ class StaticTransform:
     T_parent_child: Matrix4
 
 
+@dataclass(frozen=True, slots=True)
+class DecodedTransforms:
+    """The transforms of a message.
+
+    Attributes:
+        joints: the valid ones.
+        refused: why each other one was left out, by its parent and child; tf2 leaves them out, too.
+    """
+
+    joints: tuple[StaticTransform, ...]
+    refused: Mapping[tuple[str, str], DecodeError]
+
+
 class StaticTransforms:
     """All static transforms received so far. Not safe for use from several threads.
 
     Attributes:
         replaced: how often a known joint came with another value.
+        refused: why transforms were left out, by parent and child; at most `MAX_REFUSED`.
     """
 
     def __init__(self) -> None:
         self.replaced = 0
+        self.refused: dict[tuple[str, str], DecodeError] = {}
         self._joints: dict[str, dict[str, StaticTransform]] = {}
+        self._first: dict[tuple[str, str], StaticTransform] = {}
 
     @property
     def frames(self) -> tuple[str, ...]:
         """All named frames, sorted by name."""
         return tuple(sorted({*self._joints, *(parent for parents in self._joints.values() for parent in parents)}))
+
+    def refuse(self, refused: Mapping[tuple[str, str], DecodeError]) -> None:
+        """Notes transforms that were left out."""
+        for names, error in refused.items():
+            if len(self.refused) < MAX_REFUSED:
+                self.refused[names] = error
 
     def add(self, joints: tuple[StaticTransform, ...]) -> None:
         """Add these joints; they replace earlier joints between the same frames.
@@ -137,6 +166,7 @@ class StaticTransforms:
             before = parents.get(joint.parent)
             if before is not None and not np.array_equal(before.T_parent_child, joint.T_parent_child):
                 self.replaced += 1
+                self._first.setdefault((joint.parent, joint.child), before)
             parents[joint.parent] = joint
 
     def transform(self, target: str, source: str) -> Matrix4 | None:
@@ -159,6 +189,21 @@ class StaticTransforms:
             if on_the_way.intersection(loop)
         ]
         return (*several, *loops)
+
+    def changes(self, target: str, source: str) -> tuple[str, ...]:
+        """The transforms on the way between two frames that came with several values, one sentence each: the last one
+        holds."""
+        way = [frame for frame, _ in self._path(bare(target), bare(source)) or ()]
+        steps = {frozenset(step) for step in pairwise(way)}
+        sentences = []
+        for (parent, child), first in self._first.items():
+            last = self._joints[child][parent]
+            xi = se3.difference(first.T_parent_child, last.T_parent_child)
+            turned_deg, moved_m = float(np.degrees(np.linalg.norm(xi[:3]))), float(np.linalg.norm(xi[3:]))
+            if frozenset((parent, child)) in steps and max(turned_deg, moved_m) > SAME:
+                apart = f"{turned_deg:.2f} deg and {moved_m:.3f} m apart"
+                sentences.append(f"{parent!a} -> {child!a} comes with several values, {apart}; the last one holds")
+        return tuple(sentences)
 
     def _path(self, target: str, source: str) -> list[tuple[str, Matrix4]] | None:
         """The frames from source to target, each with T_frame_source (4, 4)."""
@@ -205,13 +250,21 @@ class StaticTransforms:
             done.update(way)
 
 
-def decode_static_transforms(payload: bytes) -> tuple[StaticTransform, ...]:
-    """The joints of a `TFMessage` in CDR.
+def decode_static_transforms(payload: bytes) -> DecodedTransforms:
+    """The joints of a `TFMessage` in CDR, without those that are invalid.
 
     Raises:
-        DecodeError: not this message, or one of its transforms is invalid.
+        DecodeError: not this message.
     """
-    return tuple(_static_transform(stamped) for stamped in transforms_in(payload))
+    joints: list[StaticTransform] = []
+    refused: dict[tuple[str, str], DecodeError] = {}
+    for stamped in transforms_in(payload):
+        try:
+            joints.append(_static_transform(stamped))
+        except DecodeError as error:
+            names = (bare(stamped.header.frame_id)[:MAX_FRAME_ID], bare(stamped.child_frame_id)[:MAX_FRAME_ID])
+            refused[names] = error
+    return DecodedTransforms(tuple(joints), refused)
 
 
 def _static_transform(stamped: Any) -> StaticTransform:
