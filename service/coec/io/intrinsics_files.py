@@ -95,7 +95,7 @@ def cameras_of(document: Any, size: tuple[int, int] | None = None) -> dict[str, 
     if isinstance(basalt, dict) and isinstance(basalt.get("intrinsics"), list):
         sizes = basalt.get("resolution")
         return {
-            str(number): _named(number, _of_basalt, entry, sizes[number] if _is_list(sizes, number) else None)
+            str(number): _named(number, _of_basalt, entry, _item(sizes, number))
             for number, entry in enumerate(basalt["intrinsics"])
         }
     sensors = {name: entry["param"] for name, entry in document.items() if _is_sensor(entry)}
@@ -138,8 +138,8 @@ def with_camera(
     return {**extrinsic, "camera": lens} if whole else {**document, "camera": lens}
 
 
-def _is_list(value: Any, number: int) -> bool:
-    return isinstance(value, list) and number < len(value)
+def _item(value: Any, number: int) -> Any:
+    return value[number] if isinstance(value, list) and number < len(value) else None
 
 
 def _is_sensor(entry: Any) -> bool:

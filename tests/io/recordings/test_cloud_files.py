@@ -324,7 +324,7 @@ STAMP_NS = 1_600_000_000_100_000_000
     ids=["Hesai and RoboSense", "absolute", "µs", "Livox", "Velodyne"],
 )
 def test_times_of_a_pcd_are_recognised_as_in_messages(tmp_path: Path, name: str, code: str, times: np.ndarray) -> None:
-    kind, size = code
+    kind, size = code[0], code[1]
     rows = np.zeros(3, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), (name, f"<{kind.lower()}{size}")])
     rows[name], rows["x"] = times, 5.0
     path = tmp_path / "cloud.pcd"

@@ -118,7 +118,7 @@ def _extrinsic(index: BagIndex, pair: PairMessages, lens: _Lens) -> tuple[Matrix
     images; that of the CameraInfo instead, if only the latter is in the tree, or only with it points are in view (a
     driver that names the camera's body in its images)."""
     lidar_frame = pair.cloud.frame_id
-    named, of_name = known_frame(index, pair.camera_frame or pair.image.frame_id)
+    named, recognised = known_frame(index, pair.camera_frame or pair.image.frame_id)
     T = index.transform(named, lidar_frame)
     optical = bare(lens.frame_id)
     T_optical = None
@@ -134,8 +134,6 @@ def _extrinsic(index: BagIndex, pair: PairMessages, lens: _Lens) -> tuple[Matrix
             f"{why}. ?camera_frame=NAME says otherwise."
         )
         recognised, named, T = (Recognition("camera_frame", text, "warn"),), optical, T_optical
-    else:
-        recognised = of_name
     changes = index.transforms.changes(named, lidar_frame)
     if changes:
         recognised = (*recognised, Recognition("transform_changes", f"/tf_static: {'; '.join(changes)}.", "warn"))

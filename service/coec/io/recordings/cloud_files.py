@@ -203,7 +203,7 @@ def _of_columns(names: tuple[str, ...], layout: CloudLayout) -> tuple[Recognitio
     return (Recognition("cloud_columns", text),)
 
 
-def _fields(table: NDArray[np.void]) -> Columns:
+def _fields(table: NDArray[Any]) -> Columns:
     """The fields of a table with one number a point, by their names without the prefix of CloudCompare."""
     columns: dict[str, NDArray[Any]] = {}
     for name in table.dtype.names or ():

@@ -123,16 +123,18 @@ class CameraInfos:
             recognised.append(Recognition("camera_info_empty", text, "warn"))
         own = {content: count for content, count in calibrated.items() if content.frame_id in frames} or calibrated
         usual = max(own, key=own.__getitem__)
-        apart_px = max(np.abs(np.subtract(content.k, usual.k)).max() for content in own)
+        difference_px = max(np.abs(np.subtract(content.k, usual.k)).max() for content in own)
         others = [c for c in own if replace(c, k=usual.k, p=usual.p, frame_id="") != replace(usual, frame_id="")]
-        if not apart_px <= SAME_PX or others:
+        if not difference_px <= SAME_PX or others:
             other = max(own, key=lambda content: np.abs(np.subtract(content.k, usual.k)).max())
             raise SourceError(
                 f"the CameraInfo changes on the way, between {_lens_text(usual)} and {_lens_text(other)}: let only one "
                 "camera publish on the topic, and keep zoom and resolution as they are"
             )
-        if apart_px > 0.0:
-            text = f"The CameraInfo changes by up to {apart_px:.2f} px on the way; its most frequent content is used."
+        if difference_px > 0.0:
+            text = (
+                f"The CameraInfo changes by up to {difference_px:.2f} px on the way; its most frequent content is used."
+            )
             recognised.append(Recognition("camera_info_changes", text, "warn"))
         return usual, tuple(recognised)
 

@@ -201,8 +201,8 @@ class StaticTransforms:
             xi = se3.difference(first.T_parent_child, last.T_parent_child)
             turned_deg, moved_m = float(np.degrees(np.linalg.norm(xi[:3]))), float(np.linalg.norm(xi[3:]))
             if frozenset((parent, child)) in steps and max(turned_deg, moved_m) > SAME:
-                apart = f"{turned_deg:.2f} deg and {moved_m:.3f} m apart"
-                sentences.append(f"{parent!a} -> {child!a} comes with several values, {apart}; the last one holds")
+                distance = f"{turned_deg:.2f} deg and {moved_m:.3f} m apart"
+                sentences.append(f"{parent!a} -> {child!a} comes with several values, {distance}; the last one holds")
         return tuple(sentences)
 
     def _path(self, target: str, source: str) -> list[tuple[str, Matrix4]] | None:
