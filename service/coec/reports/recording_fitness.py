@@ -182,11 +182,7 @@ def fitness_of(recording: RecordingSource) -> Fitness:
         standing=standing,
         paired=len(pairs) / len(sampled) if sampled else 0.0,
         sync_ms=(float(np.median(sync_ms)), float(np.abs(sync_ms).max())) if len(sync_ms) else None,
-        in_view=float(
-            np.median([share_in_image(rig.camera, rig.T_camera_lidar_nominal, sweep.xyz_m) for sweep in sweeps])
-        )
-        if sweeps
-        else 0.0,
+        in_view=float(np.median(in_view)) if in_view else 0.0,
         not_finite=float(np.median([_not_finite(sweep) for sweep in sweeps])) if sweeps else 0.0,
         clocks=(clock_separation_text if pairs else clocks_text)(stamps_ns, recording.sweep_stamps_ns),
         remarks=(),

@@ -1,16 +1,11 @@
 """The door to all recordings, and the order in which they hand out their messages."""
 
-import shlex
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 import pytest
-from rosbags.rosbag1 import Writer
-from rosbags.typesys import Stores, get_typestore
 
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Rig
 from coec.errors import SourceError, UsageError
@@ -107,34 +102,6 @@ def test_what_does_not_fit_the_grammar_is_refused_with_the_accepted_forms(text: 
 def test_a_manifest_takes_no_query(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="takes none"):
         open_source(f"{tmp_path}?camera=x")
-
-
-def test_a_bag_of_ros_1_is_refused_with_the_command_that_makes_it_readable(tmp_path: Path) -> None:
-    path = tmp_path / "my drive.bag"
-    store = get_typestore(Stores.ROS1_NOETIC)
-    text = store.types["std_msgs/msg/String"]
-    with Writer(path) as bag:
-        connection = bag.add_connection("/said", text.__msgtype__, typestore=store)
-        bag.write(connection, 1, store.serialize_ros1(text("hello"), text.__msgtype__))
-    with pytest.raises(SourceError, match="is a bag of ROS 1") as caught:
-        open_source(str(path))
-    message = str(caught.value)
-    program, *labels = shlex.split(message.split("`")[1])
-    own = Path(sys.executable).with_name(program)
-    subprocess.run([str(own) if own.exists() else program, *labels], check=True, capture_output=True)
-    made = tmp_path / "my drive"
-    assert message.endswith(f"then give '{made}'")
-    with pytest.raises(SourceError, match="no message of type sensor_msgs"):
-        open_source(str(made))
-
-
-def test_a_folder_of_bags_of_ros_1_is_refused_likewise(tmp_path: Path) -> None:
-    for name in ("b.bag", "a.bag"):
-        (tmp_path / name).write_bytes(b"#ROSBAG V2.0\n")
-    with pytest.raises(
-        SourceError, match=f"rosbags-convert --src {tmp_path}/a.bag {tmp_path}/b.bag --dst {tmp_path}/ros2`"
-    ):
-        open_source(str(tmp_path))
 
 
 def test_paths_that_lead_nowhere(tmp_path: Path) -> None:

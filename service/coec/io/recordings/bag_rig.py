@@ -6,6 +6,7 @@ recognised, left out or overridden is told.
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -18,6 +19,7 @@ from coec.errors import ConfigError, SourceError
 from coec.geometry.projection import share_in_image
 from coec.io.intrinsics_files import load_camera_document, with_camera
 from coec.io.recordings.bag_index import LISTED, BagIndex
+from coec.io.recordings.bag_storage import METADATA
 from coec.io.rig_files import camera_of, load_mask, rigid_matrix
 from coec.io.ros import camera_info
 from coec.io.ros.transforms import bare
@@ -184,7 +186,14 @@ def unconnected_text(index: BagIndex, target: str, source: str) -> str:
         "give ?intrinsics=FILE with `camera:` (which may name a camera_info.yaml) and `T_camera_lidar:` as in a "
         f"dataset.yaml, or name the frames with ?camera_frame= and ?lidar_frame=; there: {listed or 'none'}"
         + (f"; left out: {left_out}" if left_out else "")
+        + part_of_bag_text(index.path)
     )
+
+
+def part_of_bag_text(path: Path) -> str:
+    """What to open instead of one file of a split bag; empty for another file."""
+    is_part = path.is_file() and (path.parent / METADATA).is_file()
+    return f"; it is one file of the bag {path.parent}: open that" if is_part else ""
 
 
 def left_out_text(index: BagIndex) -> str:
@@ -200,7 +209,8 @@ def _lens_of(index: BagIndex, pair: PairMessages) -> _Lens:
             info, recognised = _info(index, pair)
             lens = camera_info.intrinsics_of_info(info, rectified=rectified)
         except SourceError as error:
-            raise SourceError(f"the camera info of {index.path}: {error}; give ?intrinsics=FILE") from error
+            part = part_of_bag_text(index.path)
+            raise SourceError(f"the camera info of {index.path}: {error}; give ?intrinsics=FILE{part}") from error
         if lens.is_adapted:
             text = f"The lens is that of {lens.source}; give ?intrinsics=FILE if the images are not so."
             recognised = (*recognised, Recognition("camera_info_adapted", text))

@@ -8,10 +8,12 @@ Files that are packed as a whole (`compression_mode: FILE`) are unpacked into th
 when the recording is no longer used.
 """
 
+import re
 import shutil
 import sqlite3
 import tempfile
 import weakref
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
@@ -23,7 +25,7 @@ import zstandard
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from coec.config import describe, load_yaml
-from coec.errors import ConfigError, SourceError
+from coec.errors import ConfigError, DecodeError, SourceError
 from coec.io.mcap.reader import (
     MAX_CHUNK_BYTES,
     MAX_RATIO,
@@ -35,6 +37,9 @@ from coec.io.mcap.reader import (
     Schema,
     read_records,
 )
+from coec.io.recordings.recording_source import BAG_SUFFIXES
+from coec.io.ros import message_decoding, messages
+from coec.io.ros.translations import TRANSLATIONS, translation_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,8 +110,12 @@ def open_storage(path: Path) -> BagStorage:
             return McapStorage(path)
         case ".db3":
             return SqliteStorage(path)
+        case ".bag":
+            from coec.io.recordings.ros1_bag import Ros1Storage
+
+            return Ros1Storage(path)
         case _:
-            raise SourceError(f"{path} is no bag: .mcap, .db3, or a folder with metadata.yaml")
+            raise SourceError(f"{path} is no bag: .mcap, .db3, .bag, or a folder of them")
 
 
 _NO_CHUNK = -1
@@ -115,7 +124,7 @@ _NO_CHUNK = -1
 @dataclass(frozen=True, slots=True)
 class McapStorage:
     """The `Storage` of an MCAP file. A place is: file offset of the chunk (-1 outside chunks), offset in the chunk,
-    length."""
+    length; and the number of the translation of a message that is not in CDR."""
 
     path: Path
 
@@ -135,12 +144,23 @@ class McapStorage:
                         case McapMessage():
                             channel = channels.get(record.channel_id)
                             schema = None if channel is None else schemas.get(channel.schema_id)
-                            if channel is not None and schema is not None and channel.message_encoding == "cdr":
-                                yield _entry(channel.topic, schema.name, record)
+                            if channel is not None and schema is not None:
+                                yield from self._entry(channel, schema.name, record)
         except OSError as error:
             raise SourceError(f"cannot read {self.path}: {error.strerror}") from error
         except McapDamagedError as error:
             raise SourceError(error.of(self.path)) from error
+
+    def _entry(self, channel: Channel, type_name: str, message: McapMessage) -> Iterator[BagMessage]:
+        chunk_at = _NO_CHUNK if message.chunk_at is None else message.chunk_at
+        place, data = (chunk_at, message.at, len(message.data)), message.data
+        if channel.message_encoding != "cdr":
+            number = translation_of(channel.message_encoding, type_name)
+            if number is None:
+                return
+            place, type_name = (*place, number), TRANSLATIONS[number].type_name
+            data = translated(number, data, f"{self.path}: a message on {channel.topic}")
+        yield BagMessage(channel.topic, type_name, data, message.log_time_ns, place)
 
     @contextmanager
     def open(self) -> Iterator[BagReader]:
@@ -156,17 +176,28 @@ class _McapReader:
 
     def read(self, place: tuple[int, ...]) -> bytes:
         """See `Reader`."""
-        chunk_at, at, length = place
+        chunk_at, at, length, *number = place
         try:
-            return self.reader.read(None if chunk_at == _NO_CHUNK else chunk_at, at, length)
+            data = self.reader.read(None if chunk_at == _NO_CHUNK else chunk_at, at, length)
         except McapDamagedError as error:
             raise SourceError(f"{self.path}: {error}") from error
+        return translated(number[0], data, f"{self.path}: a message") if number else data
 
 
-def _entry(topic: str, type_name: str, message: McapMessage) -> BagMessage:
-    chunk_at = _NO_CHUNK if message.chunk_at is None else message.chunk_at
-    place = (chunk_at, message.at, len(message.data))
-    return BagMessage(topic, type_name, message.data, message.log_time_ns, place)
+def translated(number: int, data: bytes, where: str) -> bytes:
+    """A message in CDR, by the number of its translation. One that cannot be translated is empty if it is of a type
+    from which nothing is read, because then it is somebody else's.
+
+    Raises:
+        SourceError: another one cannot be translated.
+    """
+    translation = TRANSLATIONS[number]
+    try:
+        return translation.convert(data)
+    except DecodeError as error:
+        if translation.type_name not in (*message_decoding.KNOWN, messages.CAMERA_INFO, messages.TF):
+            return b""
+        raise SourceError(f"{where} is refused: {error}") from error
 
 
 MAX_MESSAGE_BYTES = 256 * 2**20
@@ -360,14 +391,15 @@ class _FolderReader:
 
 
 def open_folder(path: Path) -> FolderStorage:
-    """Opens the bag in a folder.
+    """Opens the bag in a folder: the files that its `metadata.yaml` names; without one, or if it names none of them (a
+    folder that was renamed), all files of a bag in the order of their numbers.
 
     Raises:
-        SourceError: `metadata.yaml` is absent or cannot be used, the storage is unknown, or a file is absent; names it.
+        SourceError: `metadata.yaml` cannot be used, or a file is absent; names it.
     """
+    if not (path / METADATA).is_file():
+        return FolderStorage(path, tuple(map(open_storage, files_of_bag(path))), packed_messages=False)
     information = _information(path)
-    if information.storage_identifier not in ("mcap", "sqlite3"):
-        raise SourceError(f"{path / METADATA}: storage {information.storage_identifier!a} is neither mcap nor sqlite3")
     mode = information.compression_mode.upper() if information.compression_format else ""
     if mode and information.compression_format != "zstd":
         raise SourceError(f"{path / METADATA}: compression {information.compression_format!a} is not zstd")
@@ -376,7 +408,8 @@ def open_folder(path: Path) -> FolderStorage:
     if len(set(names)) < len(names):
         raise SourceError(f"{path / METADATA} names a file twice")
     if mode != "FILE":
-        return FolderStorage(path, _files(path, information, names), mode == "MESSAGE")
+        present = names if any(name.is_file() for name in names) else files_of_bag(path) or names
+        return FolderStorage(path, _files(path, information, present), mode == "MESSAGE")
     unpacked = Path(tempfile.mkdtemp(prefix="coec-bag-"))
     try:
         plain = [_unpacked(file, unpacked) for file in names]
@@ -388,12 +421,34 @@ def open_folder(path: Path) -> FolderStorage:
     return storage
 
 
+def files_of_bag(path: Path) -> list[Path]:
+    """The files of bags in a folder, in the order of the numbers in their names; all of one kind, of which there are
+    most."""
+    files = [file for file in path.iterdir() if file.suffix in BAG_SUFFIXES and file.is_file()]
+    if len(files) > MAX_FILES:
+        raise SourceError(f"{path} has more than {MAX_FILES} files")
+    kinds = Counter(file.suffix for file in sorted(files))
+    kind = kinds.most_common(1)[0][0] if kinds else ""
+    return sorted((file for file in files if file.suffix == kind), key=_numbered)
+
+
+def _numbered(file: Path) -> tuple[tuple[int, str], ...]:
+    """A key by which `bag_10` comes after `bag_9`."""
+    parts = re.split(r"(\d{1,18})", file.name)
+    return tuple((int(part), "") if part.isdecimal() and part.isascii() else (-1, part) for part in parts)
+
+
 def _files(path: Path, information: BagInformation, names: Sequence[Path]) -> tuple[BagStorage, ...]:
+    """The files of a bag, by their suffix; without one, by the storage that the metadata names. `ros2 bag reindex` of
+    Humble leaves that out."""
     for name in names:
         if not name.is_file():
             raise SourceError(f"{path} lacks {name.name}, which its {METADATA} names")
-    kind = SqliteStorage if information.storage_identifier == "sqlite3" else McapStorage
-    return tuple(kind(name) for name in names)
+    kind = {"mcap": McapStorage, "sqlite3": SqliteStorage}.get(information.storage_identifier)
+    if kind is None and any(name.suffix not in BAG_SUFFIXES for name in names):
+        identifier = information.storage_identifier
+        raise SourceError(f"{path / METADATA}: storage {identifier!a} is neither mcap nor sqlite3")
+    return tuple(open_storage(name) if kind is None or name.suffix in BAG_SUFFIXES else kind(name) for name in names)
 
 
 def _information(path: Path) -> BagInformation:

@@ -2,10 +2,8 @@
 LiDARs.
 """
 
-import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -54,29 +52,9 @@ def open_source(spec: str) -> RecordingSource:
     return _open_path(parsed)
 
 
-ROS_1 = ".bag"
-
-
-def _bags_of_ros_1(path: Path) -> list[Path]:
-    """The file, or the files in a folder that holds nothing which is read."""
-    if path.is_dir():
-        readable = (path / "metadata.yaml").exists() or (path / "dataset.yaml").exists()
-        return [] if readable else sorted(file for file in path.glob(f"*{ROS_1}") if file.is_file())
-    return [path] if path.suffix == ROS_1 else []
-
-
 def _open_path(spec: SourceSpec) -> RecordingSource:
     if not spec.path.exists():
         raise SourceError(f"{spec.path} does not exist", FORMS)
-    ros_1 = _bags_of_ros_1(spec.path)
-    if ros_1:
-        given = " ".join(shlex.quote(str(path)) for path in ros_1)
-        folder = spec.path.with_suffix("") if spec.path.suffix == ROS_1 else spec.path / "ros2"
-        made = shlex.quote(str(folder))
-        raise SourceError(
-            f"{spec.path} is a bag of ROS 1, only ROS 2 bags are read: `rosbags-convert --src {given} --dst {made}` "
-            f"(installed with coec) writes one; then give {made}"
-        )
     if is_bag(spec):
         from coec.io.recordings.bag import open_bag
 
@@ -85,7 +63,7 @@ def _open_path(spec: SourceSpec) -> RecordingSource:
         from coec.io.recordings.manifest import open_manifest
 
         return open_manifest(spec)
-    raise UsageError(f"{spec.path} is neither a folder nor an .mcap, .db3, .yaml or .yml file", FORMS)
+    raise UsageError(f"{spec.path} is neither a folder nor an .mcap, .db3, .bag, .yaml or .yml file", FORMS)
 
 
 MAX_STAMP_DIFFERENCE_NS = 60_000_000

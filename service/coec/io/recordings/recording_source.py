@@ -188,8 +188,9 @@ def motions_near(motions: Collection[EgoMotion], stamps_ns: Collection[int]) -> 
 
 FORMS = """accepted forms of a source:
   FILE.mcap                                     a recorded window
-  BAG?camera=/TOPIC&points=/TOPIC&...           any ROS 2 bag: FILE.mcap, FILE.db3 or rosbag2's folder (topics are found
-                                                by type where they are unique; lidar_frame=NAME for clouds in another,
+  BAG?camera=/TOPIC&points=/TOPIC&...           any bag of ROS 2 or ROS 1: FILE.mcap, FILE.db3, FILE.bag or a folder of
+                                                them (topics are found by type where they are unique;
+                                                lidar_frame=NAME for clouds in another,
                                                 camera_frame=NAME for images that name another,
                                                 moving=PARENT,CHILD for motion on /tf, time=FIELD,UNIT[,BASE],
                                                 lidar_source=N for one LiDAR of a cloud of several; rings=,
@@ -202,6 +203,9 @@ FORMS = """accepted forms of a source:
   sim:rig=four-fisheyes&pair=front-roof&...     one pair of a simulated rig"""
 
 LAYOUTS = ("kitti360", "kitti-raw", "sim")
+
+BAG_SUFFIXES = (".mcap", ".db3", ".bag")
+"""Suffixes of the files of bags."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,9 +262,14 @@ def parse_spec(text: str) -> SourceSpec:
 
 
 def is_bag(spec: SourceSpec) -> bool:
-    """Whether the source is a ROS 2 bag or a recorded window, by the name of the file or the content of the folder."""
-    by_name = spec.path.suffix in (".mcap", ".db3") or (spec.path / "metadata.yaml").is_file()
-    return spec.layout is None and by_name
+    """Whether the source is a bag or a recorded window, by the name of the file or the content of the folder: with a
+    `metadata.yaml`, or with files of bags and without a `dataset.yaml`."""
+    path = spec.path
+    if spec.layout is not None or not path.is_dir():
+        return spec.layout is None and path.suffix in BAG_SUFFIXES
+    if (path / "metadata.yaml").is_file():
+        return True
+    return not (path / "dataset.yaml").is_file() and any(file.suffix in BAG_SUFFIXES for file in path.iterdir())
 
 
 def is_rig(spec: SourceSpec) -> bool:

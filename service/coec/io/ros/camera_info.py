@@ -42,8 +42,14 @@ MAX_SKEW_PX: Final = 0.01
 _POLYNOMIAL: Final = ("", "plumb_bob", "rational_polynomial")
 """Names of OpenCV's polynomials, which are distinguished by their coefficients instead of these names."""
 
-_ALIASES: Final = {"fisheye": "equidistant", "ds": "double_sphere", "cata": "mei", "none": ""}
-"""Other names in use: those of ROS 1, of Kalibr, and of catadioptric calibrations."""
+_ALIASES: Final = {
+    "fisheye": "equidistant",
+    "kannala_brandt": "equidistant",
+    "ds": "double_sphere",
+    "cata": "mei",
+    "none": "",
+}
+"""Other names in use: those of ROS 1, of Kalibr, of Foxglove, and of catadioptric calibrations."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -55,6 +55,20 @@ def serialized(message: Any, type_name: str) -> bytes:
     return bytes(_STORE.serialize_cdr(message, type_name, little_endian=True))
 
 
+def cdr_of_ros_1(data: bytes, type_name: str) -> bytes:
+    """A message of ROS 1 as one of ROS 2, in CDR, by the definition of ROS 2: they differ by the header's `seq`.
+
+    Raises:
+        SerdeError, ValueError, IndexError, AssertionError: the data is not this message.
+    """
+    return bytes(_STORE.ros1_to_cdr(data, type_name))
+
+
+def known_types() -> tuple[str, ...]:
+    """The names of ROS's own types, sorted."""
+    return tuple(sorted(_STORE.fielddefs))
+
+
 def is_known(type_name: str) -> bool:
     """Whether it is one of ROS's own types; only their hashes are known."""
     return type_name in _STORE.fielddefs

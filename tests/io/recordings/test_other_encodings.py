@@ -1,0 +1,329 @@
+"""Bags in other encodings and folders hold the same recording as the bag of ROS 2: ROS 1, written by `rosbags`, and
+Foxglove's schemas, written by Foxglove's SDK and as JSON."""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.writer import Writer
+from rosbags.rosbag1 import Writer as Rosbag1
+
+from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
+from coec.errors import DecodeError, SourceError
+from coec.io.recordings.layouts import open_source
+from coec.io.recordings.recording_source import RecordingSource
+from coec.io.ros.translations import TRANSLATIONS, translation_of
+from support.recordings import STORE, Bag, drive_messages
+
+DRIVE = drive_messages()
+Entry = tuple[str, str, bytes]
+"""Topic, schema and data of a message."""
+
+
+def frames(recording: RecordingSource) -> list[tuple[object, ...]]:
+    def values(message: object) -> tuple[object, ...]:
+        match message:
+            case CameraFrame():
+                return message.stamp_ns, message.frame_id, message.image.data
+            case LidarFrame():
+                return message.stamp_ns, message.frame_id, message.xyz_m.tobytes()
+            case EgoMotion():
+                return message.stamp_ns, message.frame_id, message.linear_mps
+        raise AssertionError
+
+    return [values(message) for message in recording.messages()]
+
+
+def require_same(result: RecordingSource, expected: RecordingSource) -> None:
+    assert frames(result) == frames(expected)
+    assert result.rig.camera == expected.rig.camera
+    np.testing.assert_array_equal(result.rig.T_camera_lidar_nominal, expected.rig.T_camera_lidar_nominal)
+
+
+@pytest.fixture
+def native(tmp_path: Path) -> RecordingSource:
+    return open_source(str(Bag(DRIVE).write(tmp_path / "native.mcap")))
+
+
+def of_ros_1(message: Any) -> tuple[str, bytes]:
+    name = message.__msgtype__
+    return name, bytes(STORE.cdr_to_ros1(STORE.serialize_cdr(message, name), name))
+
+
+def ros_1_bag(path: Path, compression: Rosbag1.CompressionFormat | None = None) -> Path:
+    writer = Rosbag1(path)
+    if compression is not None:
+        writer.set_compression(compression)
+    with writer:
+        connections: dict[str, Any] = {}
+        for time, (topic, message) in enumerate(DRIVE):
+            name, data = of_ros_1(message)
+            if topic not in connections:
+                definition, md5 = STORE.generate_msgdef(name, ros_version=1)
+                connections[topic] = writer.add_connection(topic, name, msgdef=definition, md5sum=md5)
+            writer.write(connections[topic], time, data)
+    return path
+
+
+def mcap(path: Path, encoding: str, messages: list[Entry], profile: str = "") -> Path:
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=2000)
+        writer.start(profile)
+        channels: dict[str, int] = {}
+        for time, (topic, schema, data) in enumerate(messages):
+            if topic not in channels:
+                channels[topic] = writer.register_channel(
+                    topic, encoding, writer.register_schema(schema, encoding, b"")
+                )
+            writer.add_message(channels[topic], time, data, time)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return path
+
+
+@pytest.mark.parametrize("compression", [None, Rosbag1.CompressionFormat.BZ2, Rosbag1.CompressionFormat.LZ4])
+def test_a_bag_of_ros_1(tmp_path: Path, native: RecordingSource, compression: Rosbag1.CompressionFormat | None) -> None:
+    require_same(open_source(str(ros_1_bag(tmp_path / "drive.bag", compression))), native)
+
+
+def test_ros_1_in_mcap(tmp_path: Path, native: RecordingSource) -> None:
+    messages = [(topic, *of_ros_1(message)) for topic, message in DRIVE]
+    named = [(topic, name.replace("/msg/", "/"), data) for topic, name, data in messages]
+    require_same(open_source(str(mcap(tmp_path / "ros1.mcap", "ros1", named, "ros1"))), native)
+
+
+def test_the_tf_of_ros_1s_first_years(tmp_path: Path, native: RecordingSource) -> None:
+    messages = [(topic, *of_ros_1(message)) for topic, message in DRIVE]
+    named = [(topic, name.replace("/msg/", "/"), data) for topic, name, data in messages]
+    old = [(t, "tf/tfMessage" if t == "/tf_static" else name, data) for t, name, data in named]
+    require_same(open_source(str(mcap(tmp_path / "old.mcap", "ros1", old))), native)
+
+
+def test_a_message_of_somebody_else_that_is_cut_off_ends_nothing(tmp_path: Path, native: RecordingSource) -> None:
+    messages = [(topic, *of_ros_1(message)) for topic, message in DRIVE]
+    named = [(topic, name.replace("/msg/", "/"), data) for topic, name, data in messages]
+    others = [("/rosout", "std_msgs/String", b"\xff" * 4), ("/own", "my_package/Thing", b"1")]
+    require_same(open_source(str(mcap(tmp_path / "a.mcap", "ros1", [*others, *named]))), native)
+    cut = [(topic, name, data[:-3] if topic == "/points" else data) for topic, name, data in named]
+    with pytest.raises(
+        SourceError, match="a message on /points is refused: not a sensor_msgs/msg/PointCloud2 of ROS 1"
+    ):
+        open_source(str(mcap(tmp_path / "b.mcap", "ros1", cut)))
+
+
+@pytest.mark.parametrize("size", [0, 5, 13, 14, 40, 4000])
+def test_a_bag_of_ros_1_that_is_cut_off_is_refused(tmp_path: Path, size: int) -> None:
+    path = ros_1_bag(tmp_path / "drive.bag")
+    path.write_bytes(path.read_bytes()[:size])
+    with pytest.raises(SourceError, match="is damaged|no message of type"):
+        open_source(str(path))
+
+
+def test_damaged_bags_of_ros_1_raise_nothing_else(tmp_path: Path) -> None:
+    path = ros_1_bag(tmp_path / "drive.bag", Rosbag1.CompressionFormat.LZ4)
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    refused = 0
+    for _ in range(60):
+        damaged = bytearray(whole)
+        for place in rng.integers(0, len(whole), 6).tolist():
+            damaged[place] ^= int(rng.integers(1, 256))
+        path.write_bytes(damaged)
+        try:
+            list(open_source(str(path)).messages())
+        except SourceError:
+            refused += 1
+    assert refused > 20
+
+
+def test_a_chunk_of_ros_1_that_would_unpack_to_gigabytes_is_not_unpacked(tmp_path: Path) -> None:
+    def record(body: bytes, **fields: bytes) -> bytes:
+        parts = [name.encode() + b"=" + value for name, value in fields.items()]
+        header = b"".join(struct.pack("<I", len(part)) + part for part in parts)
+        return struct.pack("<I", len(header)) + header + struct.pack("<I", len(body)) + body
+
+    path = tmp_path / "bomb.bag"
+    chunk = record(b"x", op=b"\x05", compression=b"bz2", size=struct.pack("<I", 2**32 - 1))
+    path.write_bytes(b"#ROSBAG V2.0\n" + chunk)
+    with pytest.raises(SourceError, match="would unpack to 4294967295 bytes"):
+        open_source(str(path))
+
+
+# --- folders --------------------------------------------------------------------------------------------------------
+
+
+def split(folder: Path, count: int = 11) -> Path:
+    folder.mkdir()
+    for number in range(count):
+        Bag(DRIVE[number::count]).write(folder / f"split_{number}.mcap")
+    return folder
+
+
+METADATA = "rosbag2_bagfile_information: {storage_identifier: '%s', relative_file_paths: [%s]}"
+
+
+def test_a_folder_without_metadata(tmp_path: Path, native: RecordingSource) -> None:
+    require_same(open_source(str(split(tmp_path / "split"))), native)
+
+
+def test_a_folder_whose_metadata_names_no_storage(tmp_path: Path, native: RecordingSource) -> None:
+    folder = split(tmp_path / "split", 2)
+    (folder / "metadata.yaml").write_text(METADATA % ("", "split_0.mcap, split_1.mcap"))
+    require_same(open_source(str(folder)), native)
+
+
+def test_a_folder_whose_files_were_renamed(tmp_path: Path, native: RecordingSource) -> None:
+    folder = split(tmp_path / "split", 2)
+    (folder / "metadata.yaml").write_text(METADATA % ("mcap", "rosbag2_0.mcap, rosbag2_1.mcap"))
+    require_same(open_source(str(folder)), native)
+
+
+def test_one_file_of_a_split_bag_names_the_folder(tmp_path: Path) -> None:
+    folder = split(tmp_path / "split", 2)
+    (folder / "metadata.yaml").write_text(METADATA % ("mcap", "split_0.mcap, split_1.mcap"))
+    with pytest.raises(SourceError, match="it is one file of the bag .*split: open that"):
+        open_source(str(folder / "split_1.mcap"))
+
+
+# --- Foxglove -------------------------------------------------------------------------------------------------------
+
+
+def foxglove_values(message: Any) -> tuple[str, dict[str, Any]] | None:
+    """Schema and fields of a message of the drive; None for motion, which these schemas do not have."""
+    header = getattr(message, "header", None)
+    head = {}
+    if header is not None:
+        stamp = {"sec": header.stamp.sec, "nsec": header.stamp.nanosec}
+        head = {"timestamp": stamp, "frame_id": header.frame_id}
+    match message.__msgtype__:
+        case "sensor_msgs/msg/CompressedImage":
+            return "CompressedImage", {**head, "data": message.data.tobytes(), "format": "jpeg"}
+        case "sensor_msgs/msg/PointCloud2":
+            fields = [{"name": field.name, "offset": field.offset, "type": 7} for field in message.fields]
+            cloud = {"point_stride": message.point_step, "fields": fields, "data": message.data.tobytes()}
+            return "PointCloud", {**head, **cloud}
+        case "sensor_msgs/msg/CameraInfo":
+            matrices = {name.upper(): getattr(message, name).tolist() for name in "dkrp"}
+            size = {"width": message.width, "height": message.height}
+            return "CameraCalibration", {**head, **size, **matrices, "distortion_model": message.distortion_model}
+        case "tf2_msgs/msg/TFMessage":
+            return "FrameTransforms", {"transforms": [foxglove_transform(one) for one in message.transforms]}
+    return None
+
+
+def foxglove_transform(stamped: Any) -> dict[str, Any]:
+    place, turn = stamped.transform.translation, stamped.transform.rotation
+    return {
+        "parent_frame_id": stamped.header.frame_id,
+        "child_frame_id": stamped.child_frame_id,
+        "translation": {axis: getattr(place, axis) for axis in "xyz"},
+        "rotation": {axis: getattr(turn, axis) for axis in "xyzw"},
+    }
+
+
+def protobuf_of(schema: str, values: dict[str, Any]) -> bytes:
+    """The message as Foxglove's SDK encodes it."""
+    sdk = pytest.importorskip("foxglove.messages")
+
+    def built(name: str, fields: dict[str, Any]) -> Any:
+        made = dict(fields)
+        if "timestamp" in made:
+            made["timestamp"] = sdk.Timestamp(**made["timestamp"])
+        if "translation" in made:
+            made["translation"] = sdk.Vector3(**made["translation"])
+            made["rotation"] = sdk.Quaternion(**made["rotation"])
+        if "transforms" in made:
+            made["transforms"] = [built("FrameTransform", one) for one in made["transforms"]]
+        if "fields" in made:
+            kind = sdk.PackedElementFieldNumericType.Float32
+            made["fields"] = [
+                sdk.PackedElementField(name=f["name"], offset=f["offset"], type=kind) for f in made["fields"]
+            ]
+        return getattr(sdk, name)(**made)
+
+    return bytes(built(schema, values).encode())
+
+
+def json_of(schema: str, values: dict[str, Any]) -> bytes:
+    del schema
+    text = {**values, "data": base64.b64encode(values["data"]).decode()} if "data" in values else values
+    return json.dumps(text).encode()
+
+
+@pytest.mark.parametrize("encoding", ["protobuf", "json"])
+def test_foxgloves_schemas(tmp_path: Path, encoding: str) -> None:
+    encode = protobuf_of if encoding == "protobuf" else json_of
+    known = [(topic, values) for topic, message in DRIVE if (values := foxglove_values(message)) is not None]
+    messages = [(topic, f"foxglove.{schema}", encode(schema, values)) for topic, (schema, values) in known]
+    result = open_source(str(mcap(tmp_path / "foxglove.mcap", encoding, messages)))
+    still = [(topic, message) for topic, message in DRIVE if topic != "/odom"]
+    require_same(result, open_source(str(Bag(still).write(tmp_path / "still.mcap"))))
+
+
+def convert(encoding: str, schema: str, data: bytes) -> bytes:
+    number = translation_of(encoding, schema)
+    assert number is not None
+    return TRANSLATIONS[number].convert(data)
+
+
+def test_a_raw_image_of_foxglove() -> None:
+    values = {"timestamp": {"sec": 1, "nsec": 2}, "frame_id": "camera", "width": 2, "height": 1, "step": 6}
+    values |= {"encoding": "rgb8", "data": b"123456"}
+    for encoding, encode in (("protobuf", protobuf_of), ("json", json_of)):
+        cdr = convert(encoding, "foxglove.RawImage", encode("RawImage", values))
+        image: Any = STORE.deserialize_cdr(cdr, "sensor_msgs/msg/Image")
+        assert (image.header.stamp.nanosec, image.header.frame_id, image.encoding) == (2, "camera", "rgb8")
+        assert (image.width, image.height, image.step, image.data.tobytes()) == (2, 1, 6, b"123456")
+
+
+@pytest.mark.parametrize(
+    ("encoding", "schema", "data"),
+    [
+        ("protobuf", "foxglove.CompressedImage", b"\x12\xff\xff\xff\xff\x0fabc"),
+        ("protobuf", "foxglove.CompressedImage", b"\x80" * 20),
+        ("protobuf", "foxglove.CompressedImage", b"\x13"),
+        ("protobuf", "foxglove.CompressedImage", b"\x10\x01"),
+        ("protobuf", "foxglove.FrameTransforms", b"\x0a\x00" * 5000),
+        ("protobuf", "foxglove.CameraCalibration", b"\x31" + bytes(8)),
+        ("protobuf", "foxglove.PointCloud", b"\x25\x00\x00\x00\x00"),
+        ("json", "foxglove.CompressedImage", b"{"),
+        ("json", "foxglove.CompressedImage", b"[]"),
+        ("json", "foxglove.CompressedImage", b'{"data": "*"}'),
+        ("json", "foxglove.CompressedImage", b'{"data": "", "timestamp": {"sec": -1}}'),
+        ("json", "foxglove.CompressedImage", b'{"data": "", "timestamp": 5}'),
+        ("json", "foxglove.FrameTransforms", b"[" * 100_000),
+        ("json", "foxglove.FrameTransforms", b'{"transforms": [{"rotation": {"x": "a"}}]}'),
+        ("json", "foxglove.RawImage", b'{"width": 1e300}'),
+        ("json", "foxglove.PointCloud", b'{"data": "", "point_stride": 4, "pose": {"position": {"x": 1}}}'),
+        ("ros1", "sensor_msgs/Image", b"\xff" * 12),
+        ("ros1", "tf2_msgs/TFMessage", b"\xff\xff\xff\xff"),
+    ],
+)
+def test_what_is_no_message_is_refused(encoding: str, schema: str, data: bytes) -> None:
+    with pytest.raises(DecodeError):
+        convert(encoding, schema, data)
+
+
+SEEDS = {
+    schema: protobuf_of(schema, values)
+    for _, message in DRIVE[:2] + DRIVE[22:23] + DRIVE[-1:]
+    if (known := foxglove_values(message)) is not None
+    for schema, values in [known]
+}
+
+
+@given(st.sampled_from(sorted(SEEDS)), st.data())
+def test_no_mutation_of_protobuf_raises_anything_else(schema: str, data: st.DataObject) -> None:
+    mutated = bytearray(SEEDS[schema])
+    for _ in range(data.draw(st.integers(1, 4))):
+        mutated[data.draw(st.integers(0, len(mutated) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        convert("protobuf", f"foxglove.{schema}", bytes(mutated))
+    except DecodeError:
+        return
