@@ -1,4 +1,4 @@
-"""The rig of a bag whose messages do not agree by name: frames, transforms and camera infos that somebody else wrote."""
+"""The rig of a bag whose messages do not agree by name: frames, transforms and camera infos of somebody else."""
 
 from __future__ import annotations
 

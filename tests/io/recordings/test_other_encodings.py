@@ -6,6 +6,7 @@ from __future__ import annotations
 import base64
 import json
 import struct
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -112,9 +113,7 @@ def test_a_message_of_somebody_else_that_is_cut_off_ends_nothing(tmp_path: Path,
     others = [("/rosout", "std_msgs/String", b"\xff" * 4), ("/own", "my_package/Thing", b"1")]
     require_same(open_source(str(mcap(tmp_path / "a.mcap", "ros1", [*others, *named]))), native)
     cut = [(topic, name, data[:-3] if topic == "/points" else data) for topic, name, data in named]
-    with pytest.raises(
-        SourceError, match="a message on /points is refused: not a sensor_msgs/msg/PointCloud2 of ROS 1"
-    ):
+    with pytest.raises(SourceError, match="on /points is refused: not a sensor_msgs/msg/PointCloud2 of ROS 1"):
         open_source(str(mcap(tmp_path / "b.mcap", "ros1", cut)))
 
 
@@ -122,7 +121,7 @@ def test_a_message_of_somebody_else_that_is_cut_off_ends_nothing(tmp_path: Path,
 def test_a_bag_of_ros_1_that_is_cut_off_is_refused(tmp_path: Path, size: int) -> None:
     path = ros_1_bag(tmp_path / "drive.bag")
     path.write_bytes(path.read_bytes()[:size])
-    with pytest.raises(SourceError, match="is damaged|no message of type"):
+    with pytest.raises(SourceError, match=r"is damaged|no message of type"):
         open_source(str(path))
 
 
@@ -187,7 +186,7 @@ def test_a_folder_whose_files_were_renamed(tmp_path: Path, native: RecordingSour
 def test_one_file_of_a_split_bag_names_the_folder(tmp_path: Path) -> None:
     folder = split(tmp_path / "split", 2)
     (folder / "metadata.yaml").write_text(METADATA % ("mcap", "split_0.mcap, split_1.mcap"))
-    with pytest.raises(SourceError, match="it is one file of the bag .*split: open that"):
+    with pytest.raises(SourceError, match=r"it is one file of the bag .*split: open that"):
         open_source(str(folder / "split_1.mcap"))
 
 
@@ -310,17 +309,16 @@ def test_what_is_no_message_is_refused(encoding: str, schema: str, data: bytes) 
         convert(encoding, schema, data)
 
 
-SEEDS = {
-    schema: protobuf_of(schema, values)
-    for _, message in DRIVE[:2] + DRIVE[22:23] + DRIVE[-1:]
-    if (known := foxglove_values(message)) is not None
-    for schema, values in [known]
-}
+@cache
+def seeds() -> list[tuple[str, bytes]]:
+    known = dict(values for _, message in DRIVE if (values := foxglove_values(message)) is not None)
+    return [(schema, protobuf_of(schema, values)) for schema, values in known.items()]
 
 
-@given(st.sampled_from(sorted(SEEDS)), st.data())
-def test_no_mutation_of_protobuf_raises_anything_else(schema: str, data: st.DataObject) -> None:
-    mutated = bytearray(SEEDS[schema])
+@given(st.integers(0, 3), st.data())
+def test_no_mutation_of_protobuf_raises_anything_else(which: int, data: st.DataObject) -> None:
+    schema, sound = seeds()[which]
+    mutated = bytearray(sound)
     for _ in range(data.draw(st.integers(1, 4))):
         mutated[data.draw(st.integers(0, len(mutated) - 1))] = data.draw(st.integers(0, 255))
     try:

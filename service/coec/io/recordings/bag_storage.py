@@ -441,13 +441,13 @@ def _numbered(file: Path) -> tuple[tuple[int, str], ...]:
 def _files(path: Path, information: BagInformation, names: Sequence[Path]) -> tuple[BagStorage, ...]:
     """The files of a bag, by their suffix; without one, by the storage that the metadata names. `ros2 bag reindex` of
     Humble leaves that out."""
-    for name in names:
-        if not name.is_file():
-            raise SourceError(f"{path} lacks {name.name}, which its {METADATA} names")
     kind = {"mcap": McapStorage, "sqlite3": SqliteStorage}.get(information.storage_identifier)
     if kind is None and any(name.suffix not in BAG_SUFFIXES for name in names):
         identifier = information.storage_identifier
         raise SourceError(f"{path / METADATA}: storage {identifier!a} is neither mcap nor sqlite3")
+    for name in names:
+        if not name.is_file():
+            raise SourceError(f"{path} lacks {name.name}, which its {METADATA} names")
     return tuple(open_storage(name) if kind is None or name.suffix in BAG_SUFFIXES else kind(name) for name in names)
 
 
