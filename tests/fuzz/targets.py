@@ -12,12 +12,15 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import msgpack
 import numpy as np
 import zenoh
 from mcap.opcode import Opcode
+from rosbags.rosbag1 import Writer as Rosbag1
+from rosbags.typesys import Stores, get_typestore
 
 from coec.calibration.rig.lidar_sampling import RangeBias
 from coec.calibration.state import PairRules, after_estimate, initial_state, restored
@@ -55,6 +58,7 @@ from coec.io.ros import message_decoding, message_encoding, messages
 from coec.io.ros.camera_info import decode_info, intrinsics_of_info
 from coec.io.ros.message_decoding import ENCODINGS
 from coec.io.ros.transforms import MovingFrame, StaticTransforms, decode_static_transforms, frames_in
+from coec.io.ros.translations import TRANSLATIONS, translation_of
 from coec.io.serialise import estimate_of, result_of
 from coec.io.zenoh.session import mode_of, settings_of
 from coec.schemas import keys
@@ -176,6 +180,7 @@ MESSAGES: Final = (
     "other/msg/Type",
     messages.TWIST_WITH_COVARIANCE,
     messages.IMU,
+    "livox_ros_driver2/msg/CustomMsg",
 )
 
 
@@ -208,6 +213,12 @@ TIME_REPORTED = PointTimeConfig(field="t", unit="us", base="clock")
 XYZ: Columns = [("x", "<f4", [1, 4]), ("y", "<f4", [2, 5]), ("z", "<f4", [3, 6])]
 
 
+LIVOX = (
+    Packer().header("livox").put("Q", STAMP_NS).put("I", 1).put("B", 1, 0, 0, 0).put("I", 1, 5)
+    .put("f", 1, 2, 3).put("B", 9, 16, 0).done()
+)  # fmt: skip
+
+
 def _cdr_seeds() -> list[bytes]:
     doubles: Columns = [(name, "<f8", values) for name, _, values in XYZ]
     messages = [
@@ -225,6 +236,7 @@ def _cdr_seeds() -> list[bytes]:
         (4, twist()),
         (6, twist_with_covariance()),
         (7, imu()),
+        (8, LIVOX),
     ]
     return [bytes([kind]) + message for kind, message in messages]
 
@@ -354,6 +366,81 @@ def _bag(data: bytes, folder: Path) -> None:
     recording = open_source(str(path))
     assert np.isfinite(recording.rig.T_camera_lidar_nominal).all()
     _played(recording)
+
+
+def _ros1(data: bytes, folder: Path) -> None:
+    path = folder / "drive.bag"
+    path.write_bytes(data)
+    _played(open_source(str(path)))
+
+
+def _ros1_seeds() -> list[bytes]:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    topics = [
+        ("/image", messages.COMPRESSED_IMAGE, compressed_image()),
+        ("/points", messages.POINT_CLOUD, SWEEP),
+        ("/odom", messages.ODOMETRY, odometry()),
+        ("/info", messages.CAMERA_INFO, _camera_info()),
+        ("/tf_static", messages.TF, _tf()),
+    ]
+    seeds = []
+    for compression in (None, *Rosbag1.CompressionFormat):
+        with TemporaryDirectory() as folder:
+            writer = Rosbag1(Path(folder) / "drive.bag")
+            if compression is not None:
+                writer.set_compression(compression)
+            with writer:
+                for time, (topic, name, cdr) in enumerate(topics):
+                    md5 = "0" * 32
+                    connection = writer.add_connection(topic, name, msgdef="uint8 a\n", md5sum=md5)
+                    writer.write(connection, time, store.cdr_to_ros1(cdr, name))
+            seeds.append((Path(folder) / "drive.bag").read_bytes())
+    return seeds
+
+
+SCHEMAS = (
+    *(("protobuf", f"foxglove.{name}") for name in ("CompressedImage", "PointCloud", "FrameTransforms", "RawImage")),
+    *(("json", f"foxglove.{name}") for name in ("CompressedImage", "PointCloud", "FrameTransforms", "RawImage")),
+    ("protobuf", "foxglove.CameraCalibration"),
+    ("json", "foxglove.CameraCalibration"),
+    ("ros1", "livox_ros_driver/CustomMsg"),
+    ("ros1", "sensor_msgs/PointCloud2"),
+)
+
+
+def _translated(data: bytes, folder: Path) -> None:
+    """The first byte chooses the encoding and the schema of the message."""
+    del folder
+    number = translation_of(*SCHEMAS[(data[0] if data else 0) % len(SCHEMAS)])
+    assert number is not None
+    assert TRANSLATIONS[number].convert(data[1:])[:2] == b"\0\1"
+
+
+def _translated_seeds() -> list[bytes]:
+    double, stamp = struct.pack("<d", 0.5), b"\x0a\x04\x08\x01\x10\x02"
+    turn = b"\x2a\x09\x21" + double
+    transform = stamp + b"\x12\x01a\x1a\x01b" + b"\x22\x09\x09" + double + turn
+    field = b"\x0a\x01x\x15\0\0\0\0\x18\x07"
+    point_cloud = stamp + b"\x12\x01l\x25\x04\0\0\0\x2a" + bytes([len(field)]) + field + b"\x32\x04abcd"
+    calibration = b"\x15\x04\0\0\0\x1d\x04\0\0\0\x22\x01m\x32\x48" + double * 9
+    stamped = {"timestamp": {"sec": 1, "nsec": 2}, "frame_id": "a", "data": "YWJj"}
+    documents = {
+        4: {**stamped, "format": "jpeg"},
+        5: {**stamped, "point_stride": 3, "fields": [{"name": "x", "offset": 0, "type": 7}]},
+        6: {"transforms": [{"translation": {"x": 1}, "rotation": {"w": 1}, "child_frame_id": "b"}]},
+        7: {**stamped, "width": 1, "height": 1, "step": 3, "encoding": "rgb8"},
+        9: {"width": 8, "height": 8, "K": [1.0] * 9, "D": [0.0] * 5},
+    }
+    livox = struct.pack("<IiII", 1, 5, 0, 1) + b"l" + struct.pack("<QI4xI", 5, 1, 1)
+    return [
+        b"\0" + stamp + b"\x12\x03abc\x1a\x04jpeg",
+        b"\1" + point_cloud,
+        b"\2\x0a" + bytes([len(transform)]) + transform,
+        b"\3" + stamp + b"\x15\x01\0\0\0\x1d\x01\0\0\0\x22\x05mono8\x2d\x01\0\0\0\x32\x01a",
+        b"\x08" + calibration,
+        *(bytes([kind]) + json.dumps(document).encode() for kind, document in documents.items()),
+        b"\x0a" + livox + struct.pack("<IfffBBB", 0, 1, 2, 3, 4, 5, 6),
+    ]
 
 
 def _nominal(data: bytes, folder: Path) -> None:
@@ -834,6 +921,8 @@ TARGETS: Final = {
         Target("manifest", _manifest, _manifest_seeds, (in_yaml,), (*YAML_TEXT, b"depth", b"double_sphere", b"mei")),
         Target("kitti", _kitti, lambda: [b"R: 1 0 0\nT: 1 2 3\n", b"2013-05-28 08:46:02.904483072\n"]),
         Target("bag", _bag, _bag_seeds, (in_records,), (b"lz4", b"zstd", b"equidistant")),
+        Target("ros1", _ros1, _ros1_seeds, labels=(b"op=", b"conn=", b"compression=", b"bz2", b"lz4")),
+        Target("translated", _translated, _translated_seeds, labels=(b"timestamp", b"frame_id")),
         Target("nominal", _nominal, _nominal_seeds, (behind(1, checksummed),), (b"equidistant", b"camera", *JSON_TEXT)),
         Target("window", _window, _window_seeds, (in_records,), (b"lz4", b"zstd")),
         Target("selector", _selector, _selector_seeds, labels=(b";", b"=", b"/", b"@v1", b"*", b"?", b"_")),

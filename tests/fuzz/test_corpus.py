@@ -91,6 +91,14 @@ def test_pcd(held: Replay) -> None:
     held("pcd")
 
 
+def test_ros1(held: Replay) -> None:
+    held("ros1")
+
+
+def test_translated(held: Replay) -> None:
+    held("translated")
+
+
 def test_ply(held: Replay) -> None:
     held("ply")
 

@@ -94,7 +94,12 @@ TopicName = Annotated[str, Field(pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+$", max_le
 """A full ROS 2 topic name (rmw/validate_full_topic_name.h)."""
 
 CameraMessage = Literal["sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"]
-LidarMessage = Literal["sensor_msgs/msg/PointCloud2"]
+LidarMessage = Literal[
+    "sensor_msgs/msg/PointCloud2",
+    "livox_ros_driver2/msg/CustomMsg",
+    "livox_ros_driver/msg/CustomMsg",
+    "livox_interfaces/msg/CustomMsg",
+]
 EgoMessage = Literal[
     "nav_msgs/msg/Odometry",
     "geometry_msgs/msg/TwistStamped",

@@ -18,11 +18,16 @@ from mcap.writer import Writer
 from rosbags.rosbag1 import Writer as Rosbag1
 
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
+from coec.config import LimitsConfig
 from coec.errors import DecodeError, SourceError
+from coec.io.recordings.bag import open_topics
 from coec.io.recordings.layouts import open_source
-from coec.io.recordings.recording_source import RecordingSource
+from coec.io.recordings.recording_source import RecordingSource, parse_spec
+from coec.io.ros import messages
+from coec.io.ros.message_decoding import decode
 from coec.io.ros.translations import TRANSLATIONS, translation_of
 from support.recordings import STORE, Bag, drive_messages
+from support.ros import Packer
 
 DRIVE = drive_messages()
 Entry = tuple[str, str, bytes]
@@ -325,3 +330,80 @@ def test_no_mutation_of_protobuf_raises_anything_else(which: int, data: st.DataO
         convert("protobuf", f"foxglove.{schema}", bytes(mutated))
     except DecodeError:
         return
+
+
+# --- types that hold frames in another form -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("encoding", "schema", "advice"),
+    [
+        ("cdr", "ffmpeg_image_transport_msgs/msg/FFMPEGPacket", r"/other has .*packets of video are no pictures"),
+        ("protobuf", "foxglove.CompressedVideo", r"/other has foxglove_msgs/msg/CompressedVideo: packets of video"),
+        ("cdr", "point_cloud_interfaces/msg/CompressedPointCloud2", r"point_cloud_transport republish"),
+    ],
+)
+def test_a_bag_of_packed_frames_is_refused_with_what_to_do(
+    tmp_path: Path, encoding: str, schema: str, advice: str
+) -> None:
+    path = mcap(tmp_path / "packed.mcap", encoding, [("/other", schema, b"\0\1\0\0" + bytes(20))])
+    with pytest.raises(SourceError, match=advice):
+        open_source(str(path))
+    assert "/other" in open_topics(parse_spec(str(path))).infos or encoding != "cdr"
+
+
+POINTS = [(0, 1.0, 2.0, 3.0, 10, 16, 0), (50_000_000, 4.0, 5.0, 6.0, 20, 0, 1), (100_000_000, 7.0, 8.0, 9.0, 30, 0, 3)]
+
+
+def livox_cdr(stamp_s: int = 5, frame: str = "livox_frame", points: list[tuple[Any, ...]] = POINTS) -> bytes:
+    """A `CustomMsg`, by hand."""
+    packer = Packer().put("i", stamp_s).put("I", 0).text(frame).put("Q", stamp_s * 10**9).put("I", len(points))
+    packer.put("B", 1, 0, 0, 0).put("I", len(points))
+    for offset, x, y, z, reflectivity, tag, line in points:
+        packer.put("I", offset).put("f", x, y, z).put("B", reflectivity, tag, line)
+    return packer.done()
+
+
+def livox_ros_1(frame: bytes = b"livox_frame") -> bytes:
+    head = struct.pack("<IiII", 7, 5, 0, len(frame)) + frame + struct.pack("<QIBBBBI", 5 * 10**9, 3, 1, 0, 0, 0, 3)
+    return head + b"".join(struct.pack("<IfffBBB", *point) for point in POINTS)
+
+
+def test_livoxs_own_message_is_read_as_the_cloud_that_it_holds() -> None:
+    limits = LimitsConfig()
+    sweep = decode("livox_ros_driver2/msg/CustomMsg", livox_cdr(), limits)
+    again = decode(messages.POINT_CLOUD, convert("ros1", "livox_ros_driver/CustomMsg", livox_ros_1()), limits)
+    for frame in (sweep, again):
+        assert isinstance(frame, LidarFrame)
+        assert (frame.stamp_ns, frame.frame_id) == (5 * 10**9, "livox_frame")
+        assert frame.xyz_m.tolist() == [[1, 2, 3], [4, 5, 6], [7, 8, 9]]
+        assert frame.intensity is not None
+        assert frame.intensity.tolist() == [10, 20, 30]
+        assert frame.time_offset_s is not None
+        np.testing.assert_allclose(frame.time_offset_s, [0.0, 0.05, 0.1], atol=1e-7)
+    for length in (0, 1, 3, 11):
+        other = decode("livox_ros_driver/msg/CustomMsg", livox_cdr(frame="x" * length), limits)
+        assert isinstance(other, LidarFrame)
+        assert len(other.xyz_m) == 3
+
+
+@pytest.mark.parametrize("size", range(0, 120, 7))
+def test_a_message_of_livox_that_is_cut_off_is_refused(size: int) -> None:
+    assert len(livox_cdr()) > 100
+    with pytest.raises(DecodeError):
+        decode("livox_ros_driver2/msg/CustomMsg", livox_cdr()[: min(size, len(livox_cdr()) - 1)], LimitsConfig())
+    with pytest.raises(DecodeError):
+        convert("ros1", "livox_ros_driver2/CustomMsg", livox_ros_1()[: min(size, len(livox_ros_1()) - 1)])
+
+
+def test_a_bag_of_livox(tmp_path: Path, native: RecordingSource) -> None:
+    entries = []
+    for topic, message in DRIVE:
+        name, data = message.__msgtype__, bytes(STORE.serialize_cdr(message, message.__msgtype__))
+        if topic == "/points":
+            xyz = np.frombuffer(message.data.tobytes(), "<f4").reshape(-1, 3)
+            points = [(0, *row, 0, 0, 0) for row in xyz.tolist()]
+            name, data = "livox_ros_driver2/msg/CustomMsg", livox_cdr(0, "lidar", points)
+            data = data[:4] + struct.pack("<iI", message.header.stamp.sec, message.header.stamp.nanosec) + data[12:]
+        entries.append((topic, name, data))
+    require_same(open_source(str(mcap(tmp_path / "livox.mcap", "cdr", entries))), native)

@@ -288,7 +288,7 @@ def test_a_type_that_is_not_read_is_refused() -> None:
 @pytest.mark.parametrize(
     ("type_name", "advice"),
     [
-        ("livox_ros_driver2/msg/CustomMsg", "xfer_format"),
+        ("point_cloud_interfaces/msg/CompressedPointCloud2", "republish"),
         ("ffmpeg_image_transport_msgs/msg/FFMPEGPacket", "JPEG"),
         ("velodyne_msgs/msg/VelodyneScan", "PointCloud2"),
     ],

@@ -447,6 +447,8 @@ def open_topics(spec: recording_source.SourceSpec) -> BagTopics:
     types: dict[str, str] = {}
     places: list[_LoggedMessage] = []
     for entry in storage.entries():
+        if not entry.data:
+            continue
         if types.setdefault(entry.topic, entry.type_name) != entry.type_name:
             raise SourceError(f"{spec.path}: {entry.topic} has messages of several types")
         places.append(_LoggedMessage(entry.logged_ns, entry.place, entry.topic))

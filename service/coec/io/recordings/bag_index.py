@@ -23,7 +23,7 @@ from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, 
 from coec.config import LimitsConfig, PointTimeConfig, describe
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.io.recordings.bag_storage import BagMessage, BagReader, BagStorage
-from coec.io.ros import camera_info, message_decoding, messages
+from coec.io.ros import camera_info, livox, message_decoding, messages
 from coec.io.ros.transforms import (
     MovingFrame,
     StaticTransform,
@@ -75,7 +75,7 @@ class CloudDecoder:
 
 
 IMAGE_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE)
-CLOUD_TYPES = (messages.POINT_CLOUD,)
+CLOUD_TYPES = (messages.POINT_CLOUD, *livox.TYPES)
 VELOCITY_TYPES = (messages.ODOMETRY, messages.TWIST, messages.TWIST_WITH_COVARIANCE)
 ROTATION_TYPES = (messages.IMU,)
 
@@ -128,6 +128,7 @@ class BagIndex:
         streams: frames by topic.
         infos: the camera infos of each topic.
         transforms: all static transforms.
+        unread: topics of types that hold frames in another form, for which `REFUSED` has advice.
         transforms_at: places of the messages of all other transforms, by topic, in the order in the bag.
     """
 
@@ -137,6 +138,7 @@ class BagIndex:
     infos: dict[str, camera_info.CameraInfos] = field(default_factory=dict)
     transforms: StaticTransforms = field(default_factory=StaticTransforms)
     transforms_at: dict[str, list[tuple[int, ...]]] = field(default_factory=dict)
+    unread: dict[str, str] = field(default_factory=dict)
 
     def topic(self, types: tuple[str, ...], requested: str | None, key: str) -> str:
         """The topic of these types that was asked for, else the only one.
@@ -146,7 +148,12 @@ class BagIndex:
         """
         topic = self.optional_topic(types, requested, key)
         if topic is None:
-            raise SourceError(f"{self.path} has no message of type {' or '.join(types)}")
+            advice = "".join(
+                f"; {other} has {type_name}: {message_decoding.REFUSED[type_name]}"
+                for other, type_name in self.unread.items()
+            )
+            named = " or ".join(name for name in types if name not in livox.TYPES)
+            raise SourceError(f"{self.path} has no message of type {named}{advice}")
         return topic
 
     def optional_topic(self, types: tuple[str, ...], requested: str | None, key: str) -> str | None:
@@ -248,6 +255,9 @@ class BagIndex:
             decoded = self._decoded(entry, decode_static_transforms)
             self.transforms.refuse(decoded.refused)
             self._decoded(entry, lambda _: self.transforms.add(decoded.joints))
+        elif name in message_decoding.REFUSED and name != messages.TF:
+            if len(self.unread) < LISTED:
+                self.unread[entry.topic] = name
         elif name == messages.TF:
             self.transforms_at.setdefault(entry.topic, []).append(entry.place)
 

@@ -157,6 +157,10 @@ class McapStorage:
         if channel.message_encoding != "cdr":
             number = translation_of(channel.message_encoding, type_name)
             if number is None:
+                # Named without its content, so that an error can say what to do.
+                of_ros = type_name.replace("foxglove.", "foxglove_msgs/msg/")
+                if of_ros in message_decoding.REFUSED:
+                    yield BagMessage(channel.topic, of_ros, b"", message.log_time_ns, place)
                 return
             place, type_name = (*place, number), TRANSLATIONS[number].type_name
             data = translated(number, data, f"{self.path}: a message on {channel.topic}")

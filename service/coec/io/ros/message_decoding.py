@@ -19,7 +19,7 @@ from coec.config import LimitsConfig, PointTimeConfig
 from coec.errors import DecodeError
 from coec.io.frame_validation import MAX_SPEED, Refusal, check_size
 from coec.io.images import BYTES_PER_PIXEL, probe, raw_image
-from coec.io.ros import messages, point_clouds
+from coec.io.ros import livox, messages, point_clouds
 from coec.io.ros.messages import check_cloud_fields, check_header, deserialized, frame_id, stamp_ns
 
 ENCODINGS: Final[dict[str, ImageFormat]] = {
@@ -169,22 +169,27 @@ def check_motion(payload: bytes) -> None:
     check_header(payload)
 
 
-_LIVOX: Final = "Livox's own message is no PointCloud2: start its driver with xfer_format 0 (or 2), which sends that"
-_VIDEO: Final = "packets of video are no pictures: take the camera's topic of JPEG (image_transport) or of raw pixels"
+_VIDEO: Final = (
+    "packets of video are no pictures: take the camera's topic of JPEG (image_transport) or of raw pixels, or unpack "
+    "them with `ros2 run image_transport republish`"
+)
+_PACKED: Final = (
+    "clouds packed by point_cloud_transport (Draco, Cloudini, zlib) are not read: unpack them with `ros2 run "
+    "point_cloud_transport republish`, and take the topic of PointCloud2"
+)
 _PACKETS: Final = "packets of the LiDAR are no points: take the topic on which its driver sends PointCloud2"
 
 REFUSED: Final = {
-    "livox_ros_driver/msg/CustomMsg": _LIVOX,
-    "livox_ros_driver2/msg/CustomMsg": _LIVOX,
-    "livox_interfaces/msg/CustomMsg": _LIVOX,
     "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": _VIDEO,
     "foxglove_msgs/msg/CompressedVideo": _VIDEO,
+    "foxglove_msgs/msg/CompressedPointCloud": _PACKED,
     "theora_image_transport/msg/Packet": _VIDEO,
     "velodyne_msgs/msg/VelodyneScan": _PACKETS,
     "ouster_sensor_msgs/msg/PacketMsg": _PACKETS,
     "ouster_msgs/msg/PacketMsg": _PACKETS,
     "hesai_ros_driver/msg/UdpFrame": _PACKETS,
     "rslidar_msg/msg/RslidarPacket": _PACKETS,
+    "point_cloud_interfaces/msg/CompressedPointCloud2": _PACKED,
     "sensor_msgs/msg/PointCloud": "PointCloud has been replaced by PointCloud2: convert it (point_cloud_converter)",
     messages.TF: "a transform tells where a frame is, not what it sees; it counts as motion if `ego.type` is this one",
 }
@@ -217,7 +222,11 @@ def decode(
         case messages.IMAGE:
             return _image(payload, limits)
         case messages.POINT_CLOUD:
-            return _point_cloud(payload, limits, point_time, source)
+            check_cloud_fields(payload)
+            message = deserialized(ros.sensor_msgs__msg__PointCloud2, payload)
+            return _point_cloud(message, limits, point_time, source)
+        case _ if type_name in livox.TYPES:
+            return _point_cloud(livox.cloud_of_cdr(payload), limits, point_time, source)
         case _:
             instead = REFUSED.get(type_name, f"messages of this type are not read; known: {', '.join(KNOWN)}")
             raise DecodeError(Refusal.MESSAGE_TYPE, instead)
@@ -230,7 +239,7 @@ _MOTIONS: Final[dict[str, Callable[[bytes], EgoMotion]]] = {
     messages.IMU: imu,
 }
 
-KNOWN: Final = (messages.COMPRESSED_IMAGE, messages.IMAGE, messages.POINT_CLOUD, *_MOTIONS)
+KNOWN: Final = (messages.COMPRESSED_IMAGE, messages.IMAGE, messages.POINT_CLOUD, *_MOTIONS, *livox.TYPES)
 """Types of messages that hold a frame."""
 
 
@@ -249,9 +258,10 @@ def _image(payload: bytes, limits: LimitsConfig) -> CameraFrame:
 
 
 def _point_cloud(
-    payload: bytes, limits: LimitsConfig, point_time: PointTimeConfig | None, source: int | None
+    message: ros.sensor_msgs__msg__PointCloud2,
+    limits: LimitsConfig,
+    point_time: PointTimeConfig | None,
+    source: int | None,
 ) -> LidarFrame:
-    check_cloud_fields(payload)
-    message = deserialized(ros.sensor_msgs__msg__PointCloud2, payload)
     frame_id(message.header.frame_id)
     return point_clouds.frame_of(message, stamp_ns(message.header), limits, point_time=point_time, source=source)
