@@ -214,7 +214,7 @@ XYZ: Columns = [("x", "<f4", [1, 4]), ("y", "<f4", [2, 5]), ("z", "<f4", [3, 6])
 
 
 LIVOX = (
-    Packer().header("livox").put("Q", STAMP_NS).put("I", 1).put("B", 1, 0, 0, 0).put("I", 1, 5)
+    Packer().header("livox").put("Q", STAMP_NS).put("I", 1).put("B", 1, 0, 0, 0).put("I", 1, 0)
     .put("f", 1, 2, 3).put("B", 9, 16, 0).done()
 )  # fmt: skip
 
