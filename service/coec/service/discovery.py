@@ -21,12 +21,13 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 from pydantic import Field, ValidationError
 
-from coec.calibration.types import Matrix4, Reason
+from coec.calibration.types import ImageFormat, Matrix4, Reason
 from coec.config import (
     IDENTITY,
     AnyStreamConfig,
     CameraIntrinsics,
     Config,
+    LimitsConfig,
     Matrix4x4,
     OpenPairConfig,
     PairConfig,
@@ -35,8 +36,10 @@ from coec.config import (
 )
 from coec.errors import ConfigError, SourceError
 from coec.geometry.se3 import difference
+from coec.io.images import BYTES_PER_PIXEL
 from coec.io.rig_files import matrix_rows, rig_of
 from coec.io.ros.camera_info import CameraInfoContent, info_topic, intrinsics_of_info, is_rectified
+from coec.io.ros.messages import IMAGE
 from coec.io.ros.transforms import StaticTransforms, bare
 from coec.io.storage import StateFile
 from coec.schemas.keys import TF_STATIC
@@ -81,13 +84,23 @@ class ReceivedImage:
 @dataclass(slots=True)
 class ReceivedMetadata:
     """What was heard of one pair so far. `cloud` and `ego` are the frame names in the latest cloud and motion.
-    `refused` says for a source (`camera`, `lidar`, `ego`, `info`) why its latest message could not be used."""
+    `refused` says for a source (`camera`, `lidar`, `ego`, `info`) why its latest message could not be used.
+    `max_message_bytes` is the largest message that the session lets through."""
 
     image: ReceivedImage | None = None
     cloud: str | None = None
     ego: str | None = None
     info: CameraInfoContent | None = None
     refused: dict[str, str] = field(default_factory=dict)
+    max_message_bytes: int = LimitsConfig().max_message_bytes
+
+    def dropped_bytes(self, pair: OpenPairConfig) -> int:
+        """Bytes of a raw colour image of the size in the `CameraInfo`, if that is above the limit, so that Zenoh drops
+        each image unseen; 0 if images come, or need not be so large."""
+        if self.image is not None or self.info is None or pair.camera.assumed_type != IMAGE:
+            return 0
+        size = self.info.size[0] * self.info.size[1] * BYTES_PER_PIXEL[ImageFormat.BGR8]
+        return size if size > self.max_message_bytes else 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +214,16 @@ class _Search:
     def camera_frame(self) -> str | None:
         pair, image = self._pair, self._received.image
         if image is None and (pair.camera.frame_id is None or pair.camera.intrinsics is None):
-            raise _MissingError(Reason("no_image", self._silent("camera", "image", pair.camera.place)))
+            text = self._silent("camera", "image", pair.camera.place)
+            dropped = self._received.dropped_bytes(pair)
+            if dropped:
+                limit = self._received.max_message_bytes
+                text += (
+                    f" Images of the size in its CameraInfo have {dropped} bytes as raw colours, and messages above "
+                    f"limits.max_message_bytes, {limit}, are dropped before they are seen: raise that, here and at the "
+                    "router, or take the topic of compressed images."
+                )
+            raise _MissingError(Reason("no_image", text))
         if pair.camera.frame_id is not None:
             return pair.camera.frame_id
         assert image is not None

@@ -23,7 +23,7 @@ from coec.io.ros.transforms import MAX_MESSAGE_BYTES, StaticTransforms, decode_s
 from coec.io.system import ServiceThread
 from coec.io.zenoh.bus import CDR, InputSample
 from coec.service.discovery import DiscoveredPair, ReceivedImage, ReceivedMetadata, change_since, discover
-from coec.service.ingest.decoder import SampleReader
+from coec.service.ingest.decoder import CAMERA, SampleReader
 
 _log = logging.getLogger(__name__)
 
@@ -42,6 +42,9 @@ second."""
 
 IDLE_S = 0.25
 """Time between two turns, s."""
+
+TOO_LARGE_CAUSE = "message_too_large"
+"""Cause of a loss: an image above `limits.max_message_bytes`."""
 
 INFO = "info"
 """Place of a loss: a `CameraInfo`. The streams `camera` and so on are places, too."""
@@ -101,7 +104,13 @@ class DiscoveryListener:
         self._config = config
         requested = {pair.name: pair for pair in config.awaited}
         self._pairs = {
-            name: _PendingPair(pair, _readers(pair, config), discovered=earlier.get(name), built=name in earlier)
+            name: _PendingPair(
+                pair,
+                _readers(pair, config),
+                ReceivedMetadata(max_message_bytes=config.limits.max_message_bytes),
+                discovered=earlier.get(name),
+                built=name in earlier,
+            )
             for name, pair in requested.items()
         }
         self._transforms = StaticTransforms()
@@ -234,6 +243,11 @@ class DiscoveryListener:
         info = decode_info(_payload(sample, messages.CAMERA_INFO))
         each.news |= info != each.received.info
         each.received.info = info
+        if each.received.dropped_bytes(each.pair):
+            # Zenoh drops such images, and tells nobody: each CameraInfo stands for one.
+            each.lost[f"{CAMERA}_{TOO_LARGE_CAUSE}"] += 1
+            each.news = True
+            _log_loss(CAMERA, TOO_LARGE_CAUSE, each.lost[f"{CAMERA}_{TOO_LARGE_CAUSE}"])
 
     def _take_frame(self, each: _PendingPair, stream: str, sample: InputSample) -> None:
         received = each.received

@@ -197,3 +197,46 @@ def test_a_flood_of_transforms_is_bounded_and_the_newest_count() -> None:
         watch.update()
     assert watch.nominal("front").losses == {"tf_static_overrun": 2 * TRANSFORMS_WAITING + 2}
     assert codes(watch) == ["being_built"]
+
+
+def test_raw_images_that_zenoh_drops_are_named_and_counted_by_their_camera_info() -> None:
+    config = CONFIG.model_validate(
+        {"middleware": "rmw_zenoh", "pairs": [{"name": "front", "camera": "/front/image_raw", "points": "/top/points"}]}
+    )
+    large = camera_info_message("plumb_bob", [])
+    large.width, large.height = 4096, 3000
+    watch = DiscoveryListener(config, {})
+    for _ in range(3):
+        watch.take_info("front", cdr(messages.serialized(large, messages.CAMERA_INFO), messages.CAMERA_INFO))
+        watch.update()
+    (missing,) = (reason for reason in watch.nominal("front").awaits if reason.code == "no_image")
+    assert "36864000 bytes" in missing.text
+    assert "limits.max_message_bytes, 33554432" in missing.text
+    assert watch.nominal("front").losses == {"camera_message_too_large": 3}
+    compressed = DiscoveryListener(CONFIG, {})
+    compressed.take_info("front", cdr(messages.serialized(large, messages.CAMERA_INFO), messages.CAMERA_INFO))
+    compressed.update()
+    assert compressed.nominal("front").losses == {}
+
+
+def test_an_invalid_transform_is_counted_and_costs_no_other() -> None:
+    broken = transform_message("realsense", "depth", np.eye(4))
+    broken.transform.rotation = ros.geometry_msgs__msg__Quaternion(0.0, 0.0, 0.0, 0.0)
+    message = ros.tf2_msgs__msg__TFMessage([broken, transform_message("camera", "lidar", T_BASE_TOP)])
+    watch = DiscoveryListener(CONFIG, {})
+    watch.take_frame("front", CAMERA, IMAGE)
+    watch.take_frame("front", LIDAR, POINTS)
+    watch.take_info("front", INFO)
+    watch.take_transforms(cdr(bytes(STORE.serialize_cdr(message, "tf2_msgs/msg/TFMessage")), messages.TF))
+    watch.update()
+    assert codes(watch) == ["being_built"]
+    assert watch.nominal("front").losses == {"tf_static_transform_invalid": 1}
+    other = DiscoveryListener(CONFIG, {})
+    other.take_frame("front", CAMERA, IMAGE)
+    other.take_frame("front", LIDAR, POINTS)
+    other.take_info("front", INFO)
+    alone = ros.tf2_msgs__msg__TFMessage([broken])
+    other.take_transforms(cdr(bytes(STORE.serialize_cdr(alone, "tf2_msgs/msg/TFMessage")), messages.TF))
+    other.update()
+    (missing,) = other.nominal("front").awaits
+    assert "Invalid transforms were left out: 'realsense' -> 'depth'." in missing.text

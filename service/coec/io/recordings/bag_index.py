@@ -22,7 +22,7 @@ from pydantic import ValidationError
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Recognition
 from coec.config import LimitsConfig, PointTimeConfig, describe
 from coec.errors import DecodeError, SourceError, UsageError
-from coec.io.recordings.bag_storage import BagMessage, BagReader, BagStorage
+from coec.io.recordings.bag_storage import MAX_MESSAGE_BYTES, BagMessage, BagReader, BagStorage
 from coec.io.ros import camera_info, livox, message_decoding, messages
 from coec.io.ros.transforms import (
     MovingFrame,
@@ -33,6 +33,9 @@ from coec.io.ros.transforms import (
     frames_in,
 )
 from coec.schemas.keys import TF_STATIC
+
+LIMITS: Final = LimitsConfig(max_message_bytes=MAX_MESSAGE_BYTES)
+"""A file holds larger messages than the bus lets through: raw images of 12 megapixels have 37 MB."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +74,7 @@ class CloudDecoder:
         Raises:
             DecodeError: the message holds no frame.
         """
-        return message_decoding.decode(type_name, data, LimitsConfig(), point_time=self.point_time, source=self.source)
+        return message_decoding.decode(type_name, data, LIMITS, point_time=self.point_time, source=self.source)
 
 
 IMAGE_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE)
