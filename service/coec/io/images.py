@@ -251,6 +251,24 @@ def grey_of(image: EncodedImage) -> NDArray[np.uint8]:
     return np.asarray(cv2.LUT(grey, _LUMA), dtype=np.uint8) if image.format in SUBSAMPLED else grey
 
 
+SWAPPED = 2.0
+"""How many times the bytes that count as colour have to change more from pixel to pixel than those that count as
+brightness. In pictures they change less, because eyes and cameras resolve colour less."""
+
+
+def is_order_swapped(image: EncodedImage) -> bool:
+    """Whether the bytes of YUV 4:2:2 stand in the other order than the format says: what counts as colour carries the
+    picture. False for other formats, and for pictures without contrast."""
+    if image.format not in SUBSAMPLED:
+        return False
+    pixels = np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 2).astype(np.int16)
+    luma = 1 if image.format is ImageFormat.YUV422 else 0
+    brightness, colour = pixels[:, :, luma], pixels[:, :, 1 - luma]
+    # Colours alternate between U and V, so that every second one is compared.
+    changes = [float(np.abs(np.diff(plane[:, ::2], axis=1)).mean()) for plane in (brightness, colour)]
+    return changes[1] > max(SWAPPED * changes[0], 1.0)
+
+
 def eight_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
     """The eight significant bits, see the module; uint8 is returned unchanged."""
     if pixels.dtype == np.uint8:
@@ -284,7 +302,7 @@ def probe(data: bytes, limits: LimitsConfig) -> EncodedImage:
         DecodeError: `image_unknown_format`, `image_truncated`, `image_too_large` or `image_corrupt`.
     """
     header = read_header(data)
-    _check_size(header.width, header.height, limits)
+    check_size(header.width, header.height, limits)
     check_body(header, data)
     return EncodedImage(format=header.format, width=header.width, height=header.height, data=data)
 
@@ -295,7 +313,7 @@ def raw_image(form: ImageFormat, width: int, height: int, data: bytes, limits: L
     Raises:
         DecodeError: `image_too_large` or `image_size_mismatch`.
     """
-    _check_size(width, height, limits)
+    check_size(width, height, limits)
     if (form in SUBSAMPLED and width % 2) or (form in MOSAICS and min(width, height) < _MOSAIC_PX):
         raise DecodeError(Refusal.IMAGE_SIZE_MISMATCH, f"{form} pixels come in pairs, not as {width}×{height}")
     expected = width * height * BYTES_PER_PIXEL[form]
@@ -307,7 +325,12 @@ def raw_image(form: ImageFormat, width: int, height: int, data: bytes, limits: L
     return EncodedImage(format=form, width=width, height=height, data=data)
 
 
-def _check_size(width: int, height: int, limits: LimitsConfig) -> None:
+def check_size(width: int, height: int, limits: LimitsConfig) -> None:
+    """Checks the size of an image before anything of it is allocated.
+
+    Raises:
+        DecodeError: `image_corrupt` without pixels, `image_too_large`.
+    """
     if width < 1 or height < 1:
         raise DecodeError(Refusal.IMAGE_CORRUPT, f"the image claims to be {width}×{height} pixels")
     if width * height > limits.max_image_pixels:

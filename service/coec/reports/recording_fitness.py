@@ -28,6 +28,7 @@ from coec.config import PairingConfig, WindowConfig
 from coec.geometry.cameras import Camera, domain_angle_rad, project_point, unproject_point
 from coec.geometry.points import lengths
 from coec.geometry.projection import share_in_image
+from coec.io.images import is_order_swapped
 from coec.io.recordings.recording_source import RecordingSource, evenly_spread, recognitions_of
 from coec.io.recordings.window_cutting import clock_separation_text, clocks_text
 
@@ -189,6 +190,13 @@ def fitness_of(recording: RecordingSource) -> Fitness:
     )
     recognised = [Notice(one.level, one.code, one.text) for one in recognitions_of(recording, sweeps)]
     recognised += lens_notices(rig.camera)
+    if image is not None and is_order_swapped(image.image):
+        text = (
+            f"What counts as brightness in the {image.image.format.value} images hardly changes, and what counts as "
+            "colour does: the bytes of YUV 4:2:2 are probably in the other order (uyvy for yuyv, or the reverse). Let "
+            "the camera's driver state its encoding."
+        )
+        recognised.append(Notice("warn", "yuv_order", text))
     return _with_remarks(seen, recognised)
 
 

@@ -258,6 +258,8 @@ def _locate(root: Path, requested: str | None) -> tuple[Path, Path]:
             raise SourceError(f"{root} is a single drive: leave ?drive= out")
         has_calibration = (root / "calib_velo_to_cam.txt").is_file()
         return root, root if has_calibration else root.resolve().parent
+    if (root / "calib.txt").is_file() and (root / "velodyne").is_dir():
+        raise SourceError(f"{root} is a sequence of KITTI's odometry benchmark: write kitti-odometry:{root}")
     drives = {path.parent.name: path.parent for depth in ("*", "*/*") for path in root.glob(f"{depth}/velodyne_points")}
     drive = drives[select_one(sorted(drives), requested, "drive", root)]
     return drive, drive.parent

@@ -46,6 +46,10 @@ def open_source(spec: str) -> RecordingSource:
             from coec.io.recordings.kitti import open_kitti_raw
 
             return open_kitti_raw(parsed)
+        case "kitti-odometry":
+            from coec.io.recordings.kitti_odometry import open_kitti_odometry
+
+            return open_kitti_odometry(parsed)
         case "sim":
             source: RecordingSource = installed_layout("sim").open_recording(parsed.query)
             return source
@@ -59,6 +63,10 @@ def _open_path(spec: SourceSpec) -> RecordingSource:
         from coec.io.recordings.bag import open_bag
 
         return open_bag(spec)
+    from coec.io.recordings.kitti_odometry import is_kitti_odometry, open_kitti_odometry
+
+    if is_kitti_odometry(spec.path) and not (spec.path / "dataset.yaml").is_file():
+        return open_kitti_odometry(spec)
     if spec.path.is_dir() or spec.path.suffix in (".yaml", ".yml"):
         from coec.io.recordings.manifest import open_manifest
 

@@ -125,7 +125,8 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
     spec.only()
     path = spec.path / FILE_NAME if spec.path.is_dir() else spec.path
     if not path.is_file():
-        raise SourceError(f"{spec.path} has no {FILE_NAME}; for a KITTI folder write kitti360:... or kitti-raw:...")
+        layouts = "kitti360:..., kitti-raw:... or kitti-odometry:..."
+        raise SourceError(f"{spec.path} has no {FILE_NAME}; for a KITTI folder write {layouts}")
     try:
         text, _ = load_camera_document(path)
     except ConfigError as error:

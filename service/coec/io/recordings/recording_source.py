@@ -120,6 +120,7 @@ class FramewiseRecording:
     Attributes:
         frames: the frames, ascending by `camera_stamp_ns`.
         motions: the ego-motion, ascending by `stamp_ns`.
+        recognitions: see `HasRecognitions`.
     """
 
     name: str
@@ -128,6 +129,7 @@ class FramewiseRecording:
     frames: tuple[RecordedFrame, ...]
     motions: tuple[EgoMotion, ...] = ()
     configuration: CalibrationConfig | None = None
+    recognitions: tuple[Recognition, ...] = ()
 
     @property
     def camera_stamps_ns(self) -> tuple[int, ...]:
@@ -198,11 +200,12 @@ FORMS = """accepted forms of a source:
                                                 camera_offset=, lidar_offset= where `coec check` names them)
   kitti360:ROOT?drive=...&camera=image_00       KITTI-360 in its official folders
   kitti-raw:ROOT?drive=...&camera=image_02      KITTI raw in its official folders, or one drive with its calib_*.txt
+  kitti-odometry:SEQUENCE?camera=image_2        one sequence of KITTI's odometry benchmark
   FOLDER or dataset.yaml                        images and clouds listed in a manifest
   sim:seed=1&seconds=60&camera=fisheye700&...   a seeded drive through a town that does not exist (needs coec-lab)
   sim:rig=four-fisheyes&pair=front-roof&...     one pair of a simulated rig"""
 
-LAYOUTS = ("kitti360", "kitti-raw", "sim")
+LAYOUTS = ("kitti360", "kitti-raw", "kitti-odometry", "sim")
 
 BAG_SUFFIXES = (".mcap", ".db3", ".bag")
 """Suffixes of the files of bags."""

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from rosbags.typesys.stores import ros2_humble as ros
 from rosbags.typesys.stores.ros2_humble import sensor_msgs__msg__CompressedImage as CompressedImage
 from rosbags.typesys.stores.ros2_humble import sensor_msgs__msg__Image as Image
@@ -17,6 +16,7 @@ from rosbags.typesys.stores.ros2_humble import sensor_msgs__msg__Image as Image
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame
 from coec.config import LimitsConfig, PointTimeConfig
 from coec.errors import DecodeError
+from coec.io import converted_images
 from coec.io.frame_validation import MAX_SPEED, Refusal, check_size
 from coec.io.images import BYTES_PER_PIXEL, probe, raw_image
 from coec.io.ros import livox, messages, point_clouds
@@ -63,7 +63,8 @@ def compressed_image(message: CompressedImage, limits: LimitsConfig) -> EncodedI
             Refusal.IMAGE_UNKNOWN_FORMAT,
             "packets of video (h264 and the like) are not read: take the camera's topic of JPEG or of raw pixels",
         )
-    return probe(data, limits)
+    converted = converted_images.from_file(data, limits)
+    return probe(data, limits) if converted is None else converted
 
 
 def raw_pixels(message: Image, limits: LimitsConfig) -> EncodedImage:
@@ -72,20 +73,17 @@ def raw_pixels(message: Image, limits: LimitsConfig) -> EncodedImage:
     Raises:
         DecodeError: `image_unknown_format`, `image_size_mismatch`, or the reasons of `raw_image`.
     """
+    size = (message.width, message.height, message.step, message.data)
+    if message.encoding in converted_images.SEMIPLANAR:
+        return converted_images.from_semiplanar(message.encoding, *size, limits)
+    if message.encoding in converted_images.DEEP_COLOURS:
+        return converted_images.from_deep_colours(message.encoding, *size, bool(message.is_bigendian), limits)
     form = ENCODINGS.get(message.encoding)
     if form is None:
-        raise DecodeError(Refusal.IMAGE_UNKNOWN_FORMAT, f"raw images must be one of {', '.join(ENCODINGS)}")
+        known = ", ".join((*ENCODINGS, *converted_images.SEMIPLANAR, *converted_images.DEEP_COLOURS))
+        raise DecodeError(Refusal.IMAGE_UNKNOWN_FORMAT, f"raw images must be one of {known}")
     row = message.width * BYTES_PER_PIXEL[form]
-    if message.step < row or message.data.size < (message.height - 1) * message.step + row:
-        raise DecodeError(
-            Refusal.IMAGE_SIZE_MISMATCH,
-            f"{message.height} rows of {row} bytes, {message.step} apart, do not fit into {message.data.size}",
-        )
-    pixels: NDArray[np.uint8] = message.data
-    if message.step != row:
-        pixels = np.lib.stride_tricks.as_strided(pixels, (message.height, row), (message.step, 1), writeable=False)
-    else:
-        pixels = pixels[: message.height * row]
+    pixels = converted_images.rows_of(message.data, message.height, row, message.step)
     data = pixels.tobytes()
     if message.is_bigendian and message.encoding in _DEEP:
         data = np.frombuffer(data, np.uint16).byteswap().tobytes()
