@@ -39,7 +39,7 @@ def recognitions(recording: RecordingSource) -> dict[str, Recognition]:
     return {one.code: one for one in recording.recognitions}
 
 
-def test_nothing_is_told_of_a_bag_that_leaves_nothing_open(tmp_path: Path) -> None:
+def test_nothing_is_reported_of_a_bag_that_leaves_nothing_open(tmp_path: Path) -> None:
     assert recognitions(opened(drive_messages(), tmp_path)) == {}
 
 
@@ -116,7 +116,7 @@ def test_a_frame_that_no_transform_knows_can_be_named(tmp_path: Path) -> None:
     ("topic", "key", "names"),
     [(IMAGE, "camera_frame", ("optical", "left")), (POINTS, "lidar_frame", ("lidar", "rear"))],
 )
-def test_two_sensors_on_one_topic_are_refused_until_one_is_chosen(
+def test_two_sensors_on_one_topic_are_refused_until_one_is_selected(
     tmp_path: Path, topic: str, key: str, names: tuple[str, str]
 ) -> None:
     messages = with_frames(topic, *names)
@@ -203,7 +203,7 @@ def test_camera_infos_without_end_are_few_in_memory(tmp_path: Path) -> None:
     assert recording.rig.camera.fx == pytest.approx(50.0, abs=1e-3)
 
 
-def test_a_binned_lens_is_told(tmp_path: Path) -> None:
+def test_a_binned_lens_is_reported(tmp_path: Path) -> None:
     binned = lens(100.0, width=128, height=96, binning_x=2, binning_y=2)
     recording = opened([*infos(binned), *without_info()], tmp_path)
     assert cameras.intrinsics_of(recording.rig.camera)["fx"] == 50.0

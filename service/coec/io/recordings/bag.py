@@ -121,7 +121,6 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
         T_cloud_lidar,
         clouds,
         readings,
-        cloud.frame_id,
         (*of_transforms, *of_rig, *(one for one in (of_twists, unconnected) if one is not None)),
     )
     return recording.recognised()
@@ -195,7 +194,6 @@ class BagRecording:
         T_cloud_lidar: (4, 4) pose of the LiDAR in the frame in which the points are given.
         clouds: how the clouds are read.
         readings: what a person said of the bag.
-        cloud_frame: frame in which the points are given.
         recognitions: what was recognised of the bag.
         compensated: instant for which the points were compensated before they were recorded; None: for none.
     """
@@ -208,7 +206,6 @@ class BagRecording:
     T_cloud_lidar: Matrix4
     clouds: bag_index.CloudDecoder
     readings: bag_recognition.Readings
-    cloud_frame: str
     recognitions: tuple[Recognition, ...] = ()
     compensated: str | None = None
     configuration: CalibrationConfig | None = None
@@ -311,11 +308,6 @@ class BagRecording:
         cloud = _load(self.storage, reader, place, self.clouds)
         if not isinstance(cloud, LidarFrame):
             raise SourceError(f"{self.storage.path}: the {place.type_name} of {place.stamp_ns} ns is no cloud")
-        if cloud.frame_id != self.cloud_frame:
-            raise SourceError(
-                f"{self.storage.path}: the clouds of one topic are given in the frames {self.cloud_frame!a} and "
-                f"{cloud.frame_id!a}: two LiDARs publish on it; let each have a topic of its own, and record again"
-            )
         return cloud
 
     def _sweep(self, reader: BagReader, place: Sweep) -> LidarFrame:
@@ -363,7 +355,9 @@ def _streams(
     if places and places[0].type_name == messages.ODOMETRY:
         by_poses, of_twists = bag_recognition.motion_of_odometry(reader, places, readings.motion)
         places, moved = (places, moved) if by_poses is None else ([], by_poses)
-    sweeps = [Sweep(place.stamp_ns, place.at, place.type_name, (place,)) for place in index.streams[lidar].ordered()]
+    sweeps = [
+        Sweep(place.stamp_ns, place.at, place.type_name, clouds=(place,)) for place in index.streams[lidar].ordered()
+    ]
     return PairStreams(index.streams[camera].ordered(), sweeps, places, moved), of_twists
 
 

@@ -200,7 +200,7 @@ def sweeps_of_clouds(
         load: a cloud.
         clouds: how many clouds make up a sweep; None: it is recognised.
     """
-    alone = [Sweep(place.stamp_ns, place.at, place.type_name, (place,)) for place in places]
+    alone = [Sweep(place.stamp_ns, place.at, place.type_name, clouds=(place,)) for place in places]
     if clouds is not None:
         return (alone if clouds == 1 else _joined(places, clouds)), ()
     seen = [load(place) for place in places[:FEW_CLOUDS]]
@@ -262,7 +262,7 @@ def _joined(places: Sequence[MessageLocation], count: int) -> list[Sweep]:
         row.append(place)
         if len(row) == count:
             middle = row[count // 2]
-            sweeps.append(Sweep(middle.stamp_ns, middle.at, middle.type_name, tuple(row)))
+            sweeps.append(Sweep(middle.stamp_ns, middle.at, middle.type_name, clouds=tuple(row)))
             row = []
     return sweeps
 

@@ -147,8 +147,8 @@ def _protobuf(data: bytes, fields: Fields) -> dict[str, Any]:
         elif expected == "double":
             values[name] = struct.unpack("<d", _of_kind(value, kind, _EIGHT))[0]
         else:
-            found = _of_kind(value, kind, _BYTES)
-            values[name] = found.decode(errors="replace") if expected == "text" else found
+            content = _of_kind(value, kind, _BYTES)
+            values[name] = content.decode(errors="replace") if expected == "text" else content
     return values
 
 
