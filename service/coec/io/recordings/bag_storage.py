@@ -153,7 +153,8 @@ class McapStorage:
 
     def _entry(self, channel: Channel, type_name: str, message: McapMessage) -> Iterator[BagMessage]:
         chunk_at = _NO_CHUNK if message.chunk_at is None else message.chunk_at
-        place, data = (chunk_at, message.at, len(message.data)), message.data
+        data = message.data
+        place: tuple[int, ...] = (chunk_at, message.at, len(data))
         if channel.message_encoding != "cdr":
             number = translation_of(channel.message_encoding, type_name)
             if number is None:
@@ -445,7 +446,8 @@ def _numbered(file: Path) -> tuple[tuple[int, str], ...]:
 def _files(path: Path, information: BagInformation, names: Sequence[Path]) -> tuple[BagStorage, ...]:
     """The files of a bag, by their suffix; without one, by the storage that the metadata names. `ros2 bag reindex` of
     Humble leaves that out."""
-    kind = {"mcap": McapStorage, "sqlite3": SqliteStorage}.get(information.storage_identifier)
+    kinds: dict[str, type[McapStorage | SqliteStorage]] = {"mcap": McapStorage, "sqlite3": SqliteStorage}
+    kind = kinds.get(information.storage_identifier)
     if kind is None and any(name.suffix not in BAG_SUFFIXES for name in names):
         identifier = information.storage_identifier
         raise SourceError(f"{path / METADATA}: storage {identifier!a} is neither mcap nor sqlite3")
