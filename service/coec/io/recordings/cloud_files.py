@@ -199,7 +199,8 @@ def _of_viewpoint(viewpoint: str, path: Path) -> tuple[Recognition, ...]:
 def _of_columns(names: tuple[str, ...], layout: CloudLayout) -> tuple[Recognition, ...]:
     if names in (layout.columns, XYZI, XYZI[:3]):
         return ()
-    text = f"Clouds are read as {' '.join(names)} ({UNUSED} is not used); if that is wrong, say `cloud_columns:`."
+    unused = f" ({UNUSED} is not used)" if UNUSED in names else ""
+    text = f"Clouds are read as {' '.join(names)}{unused}; if that is wrong, say `cloud_columns:`."
     return (Recognition("cloud_columns", text),)
 
 
