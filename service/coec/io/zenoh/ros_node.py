@@ -72,7 +72,7 @@ class RosTopicList:
         fitting = [name for name, known in there.items() if not set(known).isdisjoint(types)]
         if fitting:
             return f"no publisher of {topic}; there are: {listed(fitting)}"
-        kinds = " or ".join(name.rpartition("/")[2] for name in types)
+        kinds = " or ".join(dict.fromkeys(name.rpartition("/")[2] for name in types))
         return f"no publisher of {topic}; of {len(there)} topics that are there none is of type {kinds}"
 
 
