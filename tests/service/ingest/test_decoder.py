@@ -226,9 +226,9 @@ def test_ring_numbers_that_are_no_scan_lines_are_left_out_and_the_log_says_so_on
 def test_a_type_that_people_take_for_the_right_one_is_distinguished(
     bench: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
-    assert bench.take(LIDAR, b"", f"{CDR};livox_ros_driver2/msg/CustomMsg") is None
+    assert bench.take(LIDAR, b"", f"{CDR};velodyne_msgs/msg/VelodyneScan") is None
     assert bench.losses.snapshot() == {(LIDAR, "wrong_type"): 1}
-    assert "xfer_format" in caplog.text
+    assert "PointCloud2" in caplog.text
 
 
 @pytest.mark.fault("rubbish on a sensor's key", "it is counted once, by its reason")
