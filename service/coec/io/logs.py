@@ -107,6 +107,7 @@ LOST: Mapping[str, str] = MappingProxyType(
         "transform_invalid": "a transform is not finite, or no rotation",
         "transforms_too_many": "there are more transforms than can be kept",
         "two_senders": "frames are refused, because two publishers send on one topic at the same time",
+        "uncalibrated": "a CameraInfo is empty (K is zero), after one that was not",
         "unanswered": "an answer of the worker did not come in time",
         "wrong_type": "a message is of another type than the stream's",
     }

@@ -241,7 +241,14 @@ class DiscoveryListener:
     def _take_info(self, each: _PendingPair, stream: str, sample: InputSample) -> None:
         del stream
         info = decode_info(_payload(sample, messages.CAMERA_INFO))
-        each.news |= info != each.received.info
+        known = each.received.info
+        if info.k[0] == 0.0 and known is not None and known.k[0] != 0.0:
+            # A driver that starts, or a second camera that is not calibrated, takes nothing away.
+            each.lost[f"{INFO}_uncalibrated"] += 1
+            each.news = True
+            _log_loss(INFO, "uncalibrated", each.lost[f"{INFO}_uncalibrated"])
+            return
+        each.news |= info != known
         each.received.info = info
         if each.received.dropped_bytes(each.pair):
             # Zenoh drops such images, and tells nobody: each CameraInfo stands for one.

@@ -240,3 +240,14 @@ def test_an_invalid_transform_is_counted_and_costs_no_other() -> None:
     other.update()
     (missing,) = other.nominal("front").awaits
     assert "Invalid transforms were left out: 'realsense' -> 'depth'." in missing.text
+
+
+def test_an_empty_camera_info_takes_nothing_away() -> None:
+    watch = received_all()
+    empty = camera_info_message("plumb_bob", [])
+    empty.k = np.zeros(9)
+    watch.update()
+    watch.take_info("front", cdr(messages.serialized(empty, messages.CAMERA_INFO), messages.CAMERA_INFO))
+    watch.update()
+    assert codes(watch) == ["being_built"]
+    assert watch.nominal("front").losses == {"info_uncalibrated": 1}

@@ -16,9 +16,10 @@ from coec.config import CalibrationConfig
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.io.mcap.window_reader import is_window, read_window
 from coec.io.recordings import bag_index, bag_recognition, recording_source
+from coec.io.recordings.bag_folder import open_storage
 from coec.io.recordings.bag_recognition import Sweep
 from coec.io.recordings.bag_rig import PairMessages, lidar_frame_of, rig_of_bag
-from coec.io.recordings.bag_storage import BagReader, BagStorage, open_storage
+from coec.io.recordings.bag_storage import BagReader, BagStorage
 from coec.io.recordings.cloud_files import measured_from
 from coec.io.recordings.recording_source import evenly_spread
 from coec.io.ros import messages
@@ -103,27 +104,29 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
         or not isinstance(motion, EgoMotion | None)
     ):
         raise SourceError(f"{spec.path}: {camera_topic} holds no images, or no motion on the topic named for it")
-    lidar_frame, T_cloud_lidar = lidar_frame_of(index, cloud, query.get("lidar_frame"))
-    motion, unconnected = _connected(index, lidar_frame, motion, query.get("odometry_frame"))
-    if unconnected is not None:
+    pair = PairMessages(camera_topic, camera, cloud, motion, query.get("intrinsics"), query.get("camera_frame"))
+    rig, T_cloud_lidar, of_rig = _rig(index, pair, query)
+    if motion is not None and any(one.code == UNCONNECTED for one in of_rig):
         streams = replace(streams, motion=[], moved=())
-    sweep = from_origin(cloud, T_cloud_lidar, lidar_frame)
-    rig, of_rig = rig_of_bag(
-        index,
-        PairMessages(camera_topic, camera, sweep, motion, query.get("intrinsics"), query.get("camera_frame")),
-    )
-    recording = BagRecording(
-        f"{spec.path.name}{camera_topic}",
-        rig,
-        rig.T_camera_lidar_nominal,
-        storage,
-        streams,
-        T_cloud_lidar,
-        clouds,
-        readings,
-        (*of_transforms, *of_rig, *(one for one in (of_twists, unconnected) if one is not None)),
-    )
+    recognitions = (*of_transforms, *of_rig, *(() if of_twists is None else (of_twists,)))
+    name, start = f"{spec.path.name}{camera_topic}", rig.T_camera_lidar_nominal
+    recording = BagRecording(name, rig, start, storage, streams, T_cloud_lidar, clouds, readings, recognitions)
     return recording.recognised()
+
+
+UNCONNECTED = "motion_frame_unconnected"
+"""Code of the recognition that the motion is left out."""
+
+
+def _rig(
+    index: bag_index.BagIndex, pair: PairMessages, query: dict[str, str]
+) -> tuple[Rig, Matrix4, tuple[Recognition, ...]]:
+    """The rig of a pair, the pose of the LiDAR in the frame of its clouds (4, 4), and what was recognised."""
+    lidar_frame, T_cloud_lidar = lidar_frame_of(index, pair.cloud, query.get("lidar_frame"))
+    motion, unconnected = _connected(index, lidar_frame, pair.motion, query.get("odometry_frame"))
+    sweep = from_origin(pair.cloud, T_cloud_lidar, lidar_frame)
+    rig, recognised = rig_of_bag(index, replace(pair, cloud=sweep, motion=motion))
+    return rig, T_cloud_lidar, (*recognised, *(() if unconnected is None else (unconnected,)))
 
 
 def _connected(
@@ -144,7 +147,7 @@ def _connected(
         f"{lidar_frame!a}: it is left out, and nothing is compensated for motion. Record /tf_static of the whole "
         f"vehicle, or name a frame with its axes: ?odometry_frame=NAME ({lidar_frame}: the motion is the LiDAR's own)."
     )
-    return None, Recognition("motion_frame_unconnected", text, "warn")
+    return None, Recognition(UNCONNECTED, text, "warn")
 
 
 def _window_recording(path: Path) -> recording_source.FramewiseRecording:

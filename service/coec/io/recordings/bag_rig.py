@@ -18,8 +18,8 @@ from coec.config.pose_forms import with_direction
 from coec.errors import ConfigError, SourceError
 from coec.geometry.projection import share_in_image
 from coec.io.intrinsics_files import load_camera_document, with_camera
+from coec.io.recordings.bag_folder import METADATA
 from coec.io.recordings.bag_index import LISTED, BagIndex
-from coec.io.recordings.bag_storage import METADATA
 from coec.io.rig_files import camera_of, load_mask, rigid_matrix
 from coec.io.ros import camera_info
 from coec.io.ros.transforms import bare
