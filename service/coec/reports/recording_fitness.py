@@ -19,6 +19,7 @@ from coec.calibration.types import (
     MOVED,
     CameraFrame,
     EgoMotion,
+    EncodedImage,
     Estimate,
     FramePair,
     LidarFrame,
@@ -189,14 +190,7 @@ def fitness_of(recording: RecordingSource) -> Fitness:
         remarks=(),
     )
     recognised = [Notice(one.level, one.code, one.text) for one in recognitions_of(recording, sweeps)]
-    recognised += lens_notices(rig.camera)
-    if image is not None and is_order_swapped(image.image):
-        text = (
-            f"What counts as brightness in the {image.image.format.value} images hardly changes, and what counts as "
-            "colour does: the bytes of YUV 4:2:2 are probably in the other order (uyvy for yuyv, or the reverse). Let "
-            "the camera's driver state its encoding."
-        )
-        recognised.append(Notice("warn", "yuv_order", text))
+    recognised += [*lens_notices(rig.camera), *([] if image is None else image_notices(image.image))]
     return _with_remarks(seen, recognised)
 
 
@@ -309,6 +303,18 @@ def _view(seen: Fitness) -> Notice | None:
         return None
     text = f"{seen.in_view:.1%} of the points lie in the image at the nominal extrinsic: is it from LiDAR to camera?"
     return Notice("fail" if seen.in_view == 0.0 else "warn", "little_in_view", text)
+
+
+def image_notices(image: EncodedImage) -> list[Notice]:
+    """What is doubtful about an image by itself: bytes of YUV 4:2:2 in the other order."""
+    if not is_order_swapped(image):
+        return []
+    text = (
+        f"What counts as brightness in the {image.format.value} images hardly changes, and what counts as colour does: "
+        "the bytes of YUV 4:2:2 are probably in the other order (uyvy for yuyv, or the reverse). Let the camera's "
+        "driver state its encoding."
+    )
+    return [Notice("warn", "yuv_order", text)]
 
 
 def lens_notices(camera: Camera) -> list[Notice]:

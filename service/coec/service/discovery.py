@@ -251,8 +251,13 @@ class _Search:
         return IDENTITY if bare(cloud) == bare(lidar) else self._rows(CLOUD, cloud, lidar)
 
     def T_camera_lidar(self, camera: str | None, lidar: str | None) -> Matrix4x4 | None:
-        given = self._pair.T_camera_lidar
-        return given if given is not None or camera is None or lidar is None else self._rows(EXTRINSIC, camera, lidar)
+        given, info = self._pair.T_camera_lidar, self._received.info
+        if given is not None or camera is None or lidar is None:
+            return given
+        # A driver may name another frame in its images than in the CameraInfo, which is that of the lens.
+        if info is not None and info.frame_id and self._transforms.transform(camera, lidar) is None:
+            camera = info.frame_id if self._transforms.transform(info.frame_id, lidar) is not None else camera
+        return self._rows(EXTRINSIC, camera, lidar)
 
     def T_lidar_ego(self, lidar: str | None) -> Matrix4x4 | None:
         ego, frame = self._pair.ego, self._received.ego

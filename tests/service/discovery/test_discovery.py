@@ -92,6 +92,15 @@ def test_what_the_configuration_gives_it_gives() -> None:
     assert not needs_transforms(requested)
 
 
+def test_the_frame_of_the_camera_info_leads_to_the_lidar_where_that_of_the_images_does_not() -> None:
+    image, info = ReceivedImage("no_such_frame", 64, 48), replace(INFO, frame_id="cam")
+    result = detected(pair(), received(image=image, info=info))
+    assert result.pair.camera.frame_id == "no_such_frame", "images of another frame are refused"
+    np.testing.assert_allclose(result.pair.T_camera_lidar, T_CAMERA_TOP, rtol=0, atol=1e-12)
+    assert result.origins["T_camera_lidar"] == "/tf_static, between 'cam' and 'top'"
+    assert missing(pair(), received(image=image, info=replace(INFO, frame_id="nor_this"))) == ["tf_static"]
+
+
 def test_a_lidar_whose_clouds_come_in_another_frame() -> None:
     requested = pair()
     requested = requested.model_copy(update={"lidar": requested.lidar.model_copy(update={"frame_id": "top"})})

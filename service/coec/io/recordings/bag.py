@@ -98,11 +98,7 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
         motions = [*streams.moved[:1], *(_load(storage, reader, place, clouds) for place in streams.motion[:1])]
         motion = motions[0] if motions else None
         of_transforms = index.connect(query.get("camera_frame", camera.frame_id), cloud.frame_id, reader)
-    if (
-        not isinstance(camera, CameraFrame)
-        or not isinstance(cloud, LidarFrame)
-        or not isinstance(motion, EgoMotion | None)
-    ):
+    if not (isinstance(camera, CameraFrame) and isinstance(cloud, LidarFrame) and isinstance(motion, EgoMotion | None)):
         raise SourceError(f"{spec.path}: {camera_topic} holds no images, or no motion on the topic named for it")
     pair = PairMessages(camera_topic, camera, cloud, motion, query.get("intrinsics"), query.get("camera_frame"))
     rig, T_cloud_lidar, of_rig = _rig(index, pair, query)
