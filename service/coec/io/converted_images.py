@@ -31,7 +31,8 @@ DEEP_COLOURS: Final = {
 _MAX_TIFF_ENTRIES: Final = 512
 """Most entries of the first directory of a TIFF; cameras write some twenty."""
 
-_TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_SAMPLES = 256, 257, 277
+_WIDTH, _HEIGHT, _BITS, _SAMPLES, _TILE_WIDTH, _FORMAT = 256, 257, 258, 277, 322, 339
+"""Tags of a TIFF."""
 
 
 def rows_of(data: NDArray[np.uint8], height: int, row: int, step: int) -> NDArray[np.uint8]:
@@ -143,11 +144,18 @@ def _tiff_size(data: bytes, order: str) -> tuple[int, int]:
     (count,) = struct.unpack_from(f"{order}H", data, at)
     if count > _MAX_TIFF_ENTRIES:
         raise DecodeError(Refusal.IMAGE_CORRUPT, f"the TIFF has more than {_MAX_TIFF_ENTRIES} entries")
-    values = {}
-    for place in range(count):
-        tag, kind, number = struct.unpack_from(f"{order}HHI", data, at + 2 + 12 * place)
-        if kind in (3, 4) and number == 1:
-            (values[tag],) = struct.unpack_from(f"{order}{'H' if kind == 3 else 'I'}", data, at + 10 + 12 * place)
-    if values.get(_TIFF_SAMPLES, 1) > 4:
-        raise DecodeError(Refusal.IMAGE_UNKNOWN_FORMAT, "a TIFF with more than four channels is no camera's picture")
-    return values.get(_TIFF_WIDTH, 0), values.get(_TIFF_HEIGHT, 0)
+    values: dict[int, int] = {}
+    for entry in range(at + 2, at + 2 + 12 * count, 12):
+        tag, kind, number = struct.unpack_from(f"{order}HHI", data, entry)
+        if kind not in (3, 4) or number < 1:
+            continue
+        form = f"{order}{'H' if kind == 3 else 'I'}"
+        # What does not fit into the entry stands elsewhere. Of several values, one for each channel, the first counts.
+        is_inside = number * struct.calcsize(form) <= 4
+        place = entry + 8 if is_inside else struct.unpack_from(f"{order}I", data, entry + 8)[0]
+        (values[tag],) = struct.unpack_from(form, data, place)
+    plain = values.get(_SAMPLES, 1) <= 4 and values.get(_BITS, 1) <= 16 and values.get(_FORMAT, 1) == 1
+    if not plain or _TILE_WIDTH in values:
+        what = "a TIFF of tiles, of floats, or with more than four channels of 16 bits is no camera's picture"
+        raise DecodeError(Refusal.IMAGE_UNKNOWN_FORMAT, what)
+    return values.get(_WIDTH, 0), values.get(_HEIGHT, 0)

@@ -17,9 +17,11 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 from rosbags.rosbag1 import Writer as Rosbag1
 
+from coec.calibration.frames.pairing import Pairer
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
-from coec.config import LimitsConfig
+from coec.config import CalibrationConfig, LimitsConfig, PairingConfig
 from coec.errors import DecodeError, SourceError
+from coec.io.mcap.window_writer import WindowWriter
 from coec.io.recordings.bag import open_topics
 from coec.io.recordings.layouts import open_source
 from coec.io.recordings.recording_source import RecordingSource, parse_spec
@@ -193,6 +195,20 @@ def test_one_file_of_a_split_bag_names_the_folder(tmp_path: Path) -> None:
     (folder / "metadata.yaml").write_text(METADATA % ("mcap", "split_0.mcap, split_1.mcap"))
     with pytest.raises(SourceError, match=r"it is one file of the bag .*split: open that"):
         open_source(str(folder / "split_1.mcap"))
+
+
+def test_a_folder_of_recorded_windows_is_no_bag(tmp_path: Path, native: RecordingSource) -> None:
+    folder = tmp_path / "windows"
+    folder.mkdir()
+    writer = WindowWriter(
+        folder / "a.mcap", native.rig, native.rig.T_camera_lidar_nominal, "a", CalibrationConfig(), {}
+    )
+    pairer = Pairer(PairingConfig(), expects_motion=True)
+    for pair in [one for message in native.messages() for one in pairer.push(message)]:
+        writer.add(pair)
+    writer.finish()
+    with pytest.raises(SourceError, match=r"holds recorded windows, .*give one, as .*a\.mcap"):
+        open_source(str(folder))
 
 
 # --- Foxglove -------------------------------------------------------------------------------------------------------

@@ -22,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from coec.config import describe, load_yaml
 from coec.errors import ConfigError, SourceError
 from coec.io.mcap.reader import MAX_RATIO, MAX_ZSTD_WINDOW
+from coec.io.mcap.window_reader import is_window
 from coec.io.recordings.bag_storage import BagMessage, BagReader, BagStorage, McapStorage, SqliteStorage
 from coec.io.recordings.recording_source import BAG_SUFFIXES
 from coec.io.recordings.ros1_bag import Ros1Storage
@@ -142,7 +143,10 @@ def open_folder(path: Path) -> FolderStorage:
         SourceError: `metadata.yaml` cannot be used, or a file is absent; names it.
     """
     if not (path / METADATA).is_file():
-        return FolderStorage(path, tuple(map(open_storage, files_of_bag(path))), packed_messages=False)
+        files = files_of_bag(path)
+        if any(file.suffix == ".mcap" and is_window(file) for file in files[:1]):
+            raise SourceError(f"{path} holds recorded windows, each a recording of its own: give one, as {files[0]}")
+        return FolderStorage(path, tuple(map(open_storage, files)), packed_messages=False)
     information = _information(path)
     mode = information.compression_mode.upper() if information.compression_format else ""
     if mode and information.compression_format != "zstd":

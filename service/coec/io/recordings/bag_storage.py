@@ -129,7 +129,7 @@ class McapStorage:
                     yield BagMessage(channel.topic, of_ros, b"", message.log_time_ns, place)
                 return
             place, type_name = (*place, number), TRANSLATIONS[number].type_name
-            data = translated(number, data, f"{self.path}: a message on {channel.topic}")
+            data = translated_if_read(number, data, f"{self.path}: a message on {channel.topic}")
         yield BagMessage(channel.topic, type_name, data, message.log_time_ns, place)
 
     @contextmanager
@@ -154,20 +154,26 @@ class _McapReader:
         return translated(number[0], data, f"{self.path}: a message") if number else data
 
 
+_READ = frozenset((*message_decoding.KNOWN, messages.CAMERA_INFO, messages.TF))
+"""Types of ROS 2 from which something is read; messages of others are somebody else's."""
+
+
 def translated(number: int, data: bytes, where: str) -> bytes:
-    """A message in CDR, by the number of its translation. One that cannot be translated is empty if it is of a type
-    from which nothing is read, because then it is somebody else's.
+    """A message in CDR, by the number of its translation.
 
     Raises:
-        SourceError: another one cannot be translated.
+        SourceError: it cannot be translated.
     """
-    translation = TRANSLATIONS[number]
     try:
-        return translation.convert(data)
+        return TRANSLATIONS[number].convert(data)
     except DecodeError as error:
-        if translation.type_name not in (*message_decoding.KNOWN, messages.CAMERA_INFO, messages.TF):
-            return b""
         raise SourceError(f"{where} is refused: {error}") from error
+
+
+def translated_if_read(number: int, data: bytes, where: str) -> bytes:
+    """The same for a message of which something is read; any other one as it is, because its translation takes time,
+    and may fail."""
+    return translated(number, data, where) if TRANSLATIONS[number].type_name in _READ else data
 
 
 MAX_MESSAGE_BYTES = 256 * 2**20

@@ -3,6 +3,7 @@ the grammar of a SOURCE argument, `[layout:]path[?key=value&…]`.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -272,7 +273,9 @@ def is_bag(spec: SourceSpec) -> bool:
         return spec.layout is None and path.suffix in BAG_SUFFIXES
     if (path / "metadata.yaml").is_file():
         return True
-    return not (path / "dataset.yaml").is_file() and any(file.suffix in BAG_SUFFIXES for file in path.iterdir())
+    with suppress(OSError):
+        return not (path / "dataset.yaml").is_file() and any(file.suffix in BAG_SUFFIXES for file in path.iterdir())
+    return False
 
 
 def is_rig(spec: SourceSpec) -> bool:

@@ -13,9 +13,9 @@ from typing import BinaryIO, Final
 
 import lz4.frame
 
-from coec.errors import DecodeError, SourceError
+from coec.errors import SourceError
 from coec.io.mcap.reader import MAX_CHUNK_BYTES, MAX_RATIO
-from coec.io.recordings.bag_storage import MAX_NAME, MAX_TOPICS, BagMessage, BagReader, translated
+from coec.io.recordings.bag_storage import MAX_NAME, MAX_TOPICS, BagMessage, BagReader, translated, translated_if_read
 from coec.io.ros.translations import TRANSLATIONS, translation_of
 
 MAGIC: Final = b"#ROSBAG V2.0\n"
@@ -126,7 +126,7 @@ class Ros1Storage:
                 raise ValueError(f"byte {record.at}: a message has no valid time")
             seconds, nanoseconds = struct.unpack("<II", stamp)
             place = (chunk_at, record.at, len(record.data), number)
-            data = translated(number, record.data, f"{self.path}: a message on {topic}")
+            data = translated_if_read(number, record.data, f"{self.path}: a message on {topic}")
             logged_ns = seconds * 10**9 + nanoseconds
             yield BagMessage(topic, TRANSLATIONS[number].type_name, data, logged_ns, place)
 
@@ -220,10 +220,7 @@ class _Ros1Reader:
             if chunk_at != self.chunk_at:
                 self.chunk, self.chunk_at = self._chunk(chunk_at), chunk_at
             data = self.chunk[at : at + length]
-        try:
-            return TRANSLATIONS[number].convert(data)
-        except DecodeError as error:
-            raise SourceError(f"{self.path}: the file has changed: {error}") from error
+        return translated(number, data, f"{self.path}: a message")
 
     def _chunk(self, chunk_at: int) -> bytes:
         self.stream.seek(chunk_at)
