@@ -248,10 +248,11 @@ def a_sweep(columns: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("columns", [3, 4, 5, 6])
-def test_the_columns_of_a_bin_are_recognised_by_their_values(tmp_path: Path, columns: int) -> None:
-    # 4800 points: 3, 4, 5 and 6 columns fit the size of each of these files.
+@pytest.mark.parametrize("times", [1, 25])
+def test_the_columns_of_a_bin_are_recognised_by_their_values(tmp_path: Path, columns: int, times: int) -> None:
+    # 4800 points or 120,000: 3, 4, 5 and 6 columns fit the size of each of these files.
     path = tmp_path / "cloud.bin"
-    points = a_sweep(columns)
+    points = np.tile(a_sweep(columns), (times, 1))
     points.tofile(path)
     frame = load_cloud(0, "lidar", path)
     assert np.array_equal(frame.xyz_m, points[:, :3])

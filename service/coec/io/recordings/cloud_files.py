@@ -304,10 +304,18 @@ def _columns_of_bin(path: Path, data: NDArray[np.uint8]) -> tuple[str, ...]:
     return XYZI if width == len(XYZI) else _column_names(floats[: floats.size // width * width].reshape(-1, width))
 
 
+def _some(table: NDArray[Any]) -> NDArray[Any]:
+    """At most `JUDGED_ROWS` rows, randomly selected: those at even distances would hit the same column again and again
+    if the table has another width."""
+    if len(table) <= JUDGED_ROWS:
+        return table
+    return np.asarray(table[np.random.default_rng(0).integers(0, len(table), JUDGED_ROWS)])
+
+
 def _may_be_points(table: NDArray[np.float32]) -> bool:
     """Whether rows of this length may be points: coordinates of a size, intensities above zero, and columns that are
     not all distributed alike."""
-    rows = table[: JUDGED_ROWS * (len(table) // JUDGED_ROWS or 1) : len(table) // JUDGED_ROWS or 1]
+    rows = _some(table)
     rows = rows[np.isfinite(rows).all(axis=1)]
     if len(rows) == 0:
         return True
@@ -333,7 +341,7 @@ def _column_names(table: NDArray[Any]) -> tuple[str, ...]:
     width = table.shape[1]
     if width <= len(XYZI):
         return XYZI[:width]
-    some = np.asarray(table[:: len(table) // JUDGED_ROWS or 1], dtype=np.float64)
+    some = np.asarray(_some(table), dtype=np.float64)
     if _are_rings(some[:, 4], some[:, :3]):
         return (*XYZI, "ring", *(UNUSED,) * (width - 5))
     is_colour = width >= 6 and all(_are_whole(some[:, column]) for column in (3, 4, 5))
