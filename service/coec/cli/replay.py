@@ -66,11 +66,20 @@ def replay(
     decisions are listed, and compared with those of another version or of a vehicle.
     """
     window = Path(source)
-    of_drive = {"--config": config, "--pair": pair, "--log": log, "--against": against, "--report": report}
-    if _is_window(window):
-        given = [name for name, value in of_drive.items() if value is not None]
-        if given or begin_s or until_s is not None or explain_s is not None:
-            raise UsageError(f"{window} is a window: {', '.join(given) or 'a part'} applies to the replay of a drive")
+    options = {
+        "--config": config,
+        "--pair": pair,
+        "--log": log,
+        "--against": against,
+        "--from": begin_s or None,
+        "--until": until_s,
+        "--explain": explain_s,
+        "--report": report,
+    }
+    given = [name for name, value in options.items() if value is not None]
+    if _is_window(window, alone=not given):
+        if given:
+            raise UsageError(f"{window} is a window; {', '.join(given)} applies to the replay of a drive")
         return _replay_window(window, depth, as_json=as_json)
     recording, configuration = _opened(source, config, pair, depth)
     replayed = _replay_drive(recording, configuration, begin_s, until_s)
@@ -80,18 +89,17 @@ def replay(
 # --- a window -------------------------------------------------------------------------------------------------------
 
 
-def _is_window(path: Path) -> bool:
-    """Whether this is the file of a window, with or without a result."""
-    from coec.io.mcap.window_reader import read_result, read_window
+def _is_window(path: Path, *, alone: bool) -> bool:
+    """Whether this is the file of a window, with or without a result. A damaged file counts as one if it is given
+    `alone`, without an option that applies to drives."""
+    from coec.io.mcap.window_reader import is_window
 
     if path.suffix != ".mcap" or not path.is_file():
         return False
     try:
-        if read_result(path) is None:
-            read_window(path)
-    except WindowError:
-        return False
-    return True
+        return is_window(path)
+    except SourceError:
+        return alone
 
 
 def _replay_window(window: Path, depth: str | None, *, as_json: bool) -> int:
