@@ -20,6 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.objective.edges import COARSEST_BLUR_RAD
+from coec.calibration.objective.mutual_information import SearchBox
+from coec.calibration.search.global_search import sample_reach
 from coec.calibration.search.mistakes import (
     AS_GIVEN,
     AS_GIVEN_ODDS,
@@ -299,31 +301,27 @@ class _Screened:
 
 def _screened(edges: Edges, supposition: Supposition) -> _Screened:
     """The best of a cover of turns. The supposed pose is a start, too, wherever it ranks."""
-    poses = _turned(supposition.T_camera_lidar[None], _turns(REACH_RAD, COVER))
+    poses = _with_turns(supposition.T_camera_lidar[None], REACH_RAD, COVER)
     z = significances(edges.seen_by(supposition, COARSE, SCREENING_POINTS), poses)
     starts = np.concatenate([poses[:1], poses[np.argsort(-z, kind="stable")[: STARTS - 1]]])
-    poses = _turned(starts, _turns(ABOUT_RAD, COVER_ABOUT))
+    poses = _with_turns(starts, ABOUT_RAD, COVER_ABOUT)
     z = significances(edges.seen_by(supposition, MEDIUM, REFINING_POINTS), poses).reshape(STARTS, COVER_ABOUT)
     starts = poses.reshape(STARTS, COVER_ABOUT, 4, 4)[np.arange(STARTS), z.argmax(axis=1)]
     best = np.argsort(-z.max(axis=1)[1:], kind="stable")[: ASCENTS - 1] + 1
     return _Screened(supposition, float(z.max()), (starts[0], *starts[best]))
 
 
-def _turned(poses: NDArray[np.float64], turns: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(K·T, 4, 4) each of the poses (K, 4, 4), turned by rotation vectors (T, 3)."""
-    still = np.zeros_like(turns)
-    return np.concatenate([moved_by(np.ascontiguousarray(pose), turns, still) for pose in poses])
+def _with_turns(poses: NDArray[np.float64], reach_rad: float, count: int) -> NDArray[np.float64]:
+    """(K·count, 4, 4) each of the poses (K, 4, 4), and turns of it that cover a ball."""
+    box = SearchBox(reach_rad, 0.0)
+    return np.concatenate([part for pose in poses for part in (pose[None], sample_reach(pose, box, count - 1))])
 
 
-def _turns(reach_rad: float, count: int) -> NDArray[np.float64]:
-    """(count, 3) rotation vectors that cover a ball; the first is zero."""
-    return np.concatenate([np.zeros((1, 3)), reach_rad * unit_ball(count - 1)])
-
-
-def _shell() -> NDArray[np.float64]:
-    """(n, 3) turns to poses about an end where nothing fits, but about as much is in view."""
+def _shell(pose: Matrix4) -> NDArray[np.float64]:
+    """(n, 4, 4) poses about an end where nothing fits, but about as much is in view."""
     ball = unit_ball(NULL_POSES)
-    return np.asarray(NULL_RAD * ball[np.linalg.norm(ball, axis=1) > NULL_INSIDE])
+    turns = NULL_RAD * ball[np.linalg.norm(ball, axis=1) > NULL_INSIDE]
+    return moved_by(np.ascontiguousarray(pose), turns, np.zeros_like(turns))
 
 
 def _local_ascent(edges: Edges, supposition: Supposition, starts: Sequence[Matrix4]) -> Ranked:
@@ -342,7 +340,7 @@ def _settled(edges: Edges, ascended: Ranked, null: tuple[float, float] | None = 
     about the end."""
     frames = edges.seen_by(ascended.supposition, FINEST, SETTLING_POINTS)
     (end,) = _ascended(frames, [ascended.T_camera_lidar], radians(0.08))
-    around, at = alignments(frames, _turned(end[None], _shell())), frame_alignment(frames, end)
+    around, at = alignments(frames, _shell(end)), frame_alignment(frames, end)
     # What looks past the points does not scatter.
     square, in_view = around.square.sum(axis=1), float(at.square.sum())
     looking = np.argsort(-square, kind="stable")[: max(LEAST_NULL, int((square > IN_VIEW * in_view).sum()))]

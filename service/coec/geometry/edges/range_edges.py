@@ -127,6 +127,42 @@ def _along_the_rows(
     A first pass examines the rows. In most sweeps they are ascending, descending, or begin in the middle of a turn, so
     that the second pass puts every point into its final place at once.
     """
+    first, kind, fall, rise = _row_orders(row, rows, azimuth, range_m)
+    order = np.empty(first[rows], np.int32)
+    turned, far_m = np.empty(first[rows], np.float32), np.empty(first[rows], np.float32)
+    raised = np.empty(0 if one_line_per_row else first[rows], np.float32)
+    following = np.zeros(rows, np.int64)
+    for i in range(row.shape[0]):
+        if range_m[i] >= MIN_RANGE_M:
+            r = row[i]
+            k = at = following[r]
+            following[r] = k + 1
+            if kind[r] == _TURNED:
+                at = k - fall[r] if k >= fall[r] else k + first[r + 1] - first[r] - fall[r]
+            elif kind[r] == _FALLING:
+                at = rise[r] - 1 - k if k < rise[r] else rise[r] + first[r + 1] - first[r] - 1 - k
+            at += first[r]
+            order[at], turned[at], far_m[at] = i, azimuth[i], range_m[i]
+            if not one_line_per_row:
+                raised[at] = elevation[i]
+    for r in range(rows):
+        if kind[r] == _MIXED:
+            of_row = slice(first[r], first[r + 1])
+            sequence = np.argsort(turned[of_row], kind="mergesort")
+            _take(order[of_row], sequence)
+            _take(turned[of_row], sequence)
+            _take(far_m[of_row], sequence)
+            if not one_line_per_row:
+                _take(raised[of_row], sequence)
+    return order, first, turned, raised, far_m
+
+
+@njit(cache=True)
+def _row_orders(
+    row: NDArray[np.uint16], rows: int, azimuth: NDArray[np.float32], range_m: NDArray[np.float32]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Where each row begins (rows + 1,), and (rows,) the order of its azimuths and the places of its last fall and
+    rise."""
     count, first_azimuth, latest = np.zeros(rows, np.int64), np.empty(rows, np.float32), np.empty(rows, np.float32)
     falls, rises = np.zeros(rows, np.int64), np.zeros(rows, np.int64)
     fall, rise = np.zeros(rows, np.int64), np.zeros(rows, np.int64)
@@ -150,33 +186,7 @@ def _along_the_rows(
             kind[r] = _TURNED
         elif rises[r] == 0 or (rises[r] == 1 and latest[r] > first_azimuth[r]):  # the sensor turns clockwise
             kind[r] = _FALLING
-    order = np.empty(first[rows], np.int32)
-    turned, far_m = np.empty(first[rows], np.float32), np.empty(first[rows], np.float32)
-    raised = np.empty(0 if one_line_per_row else first[rows], np.float32)
-    following = np.zeros(rows, np.int64)
-    for i in range(row.shape[0]):
-        if range_m[i] >= MIN_RANGE_M:
-            r = row[i]
-            k = at = following[r]
-            following[r] = k + 1
-            if kind[r] == _TURNED:
-                at = k - fall[r] if k >= fall[r] else k + count[r] - fall[r]
-            elif kind[r] == _FALLING:
-                at = rise[r] - 1 - k if k < rise[r] else rise[r] + count[r] - 1 - k
-            at += first[r]
-            order[at], turned[at], far_m[at] = i, azimuth[i], range_m[i]
-            if not one_line_per_row:
-                raised[at] = elevation[i]
-    for r in range(rows):
-        if kind[r] == _MIXED:
-            of_row = slice(first[r], first[r + 1])
-            sequence = np.argsort(turned[of_row], kind="mergesort")
-            _take(order[of_row], sequence)
-            _take(turned[of_row], sequence)
-            _take(far_m[of_row], sequence)
-            if not one_line_per_row:
-                _take(raised[of_row], sequence)
-    return order, first, turned, raised, far_m
+    return first, kind, fall, rise
 
 
 @njit(cache=True)
