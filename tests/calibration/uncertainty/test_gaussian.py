@@ -1,5 +1,7 @@
 """The Gaussian next to a posterior, against averages over many samples of it; and what its mean owes to groups."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -7,7 +9,13 @@ from numpy.typing import NDArray
 from coec.calibration.types import Matrix4
 from coec.calibration.uncertainty.ascent import inverse_root
 from coec.calibration.uncertainty.displaced_edges import LENS, SHIFTS, SIZE, TURNS, AssumedEdges, assumed_levels
-from coec.calibration.uncertainty.gaussian import PRECISE, GaussianFit, deletion_covariance, fit_gaussian
+from coec.calibration.uncertainty.gaussian import (
+    PRECISE,
+    GaussianFit,
+    covariance_under,
+    deletion_covariance,
+    fit_gaussian,
+)
 from coec.geometry import se3
 from coec.geometry.edges.alignment import EdgeFrames
 from support.scenes import (
@@ -35,7 +43,7 @@ def level(rng: np.random.Generator) -> AssumedEdges:
 
 
 def fitted(level: AssumedEdges, share: float = SHARE, *, known: bool = True) -> GaussianFit:
-    return fit_gaussian(level, np.zeros(SIZE), PLACES, PRIOR, share, steps=PRECISE, share_is_known=known)
+    return fit_gaussian(level, np.zeros(SIZE), PLACES, PRIOR, share, effort=PRECISE, share_is_known=known)
 
 
 def slopes(level: AssumedEdges, fit: GaussianFit, samples: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -91,6 +99,38 @@ def test_frames_that_disagree_make_the_mean_uncertain(rng: np.random.Generator) 
         return float(np.sqrt(deletion_covariance(level, fitted(level, 0.02), PLACES, PRIOR)[1, 1]))
 
     assert spread(different) > 1.5 * spread(alike)
+
+
+def test_the_mean_moves_without_a_group_as_far_as_that_of_a_gaussian_fitted_without_it(
+    rng: np.random.Generator,
+) -> None:
+    """One step at common points and on a paraboloid, against a fit of the edges that are left, frame by frame."""
+    points = corner_points(rng)
+    disagreeing = [at + np.array([1.2 * (-1) ** frame, 0.0]) for frame, at in enumerate(corner_pixels(points))]
+    level = level_of(corner_edge_levels(disagreeing, points))
+    fit, means = fitted(level, 0.02), []
+    for frame in range(len(level.frames.maps)):
+        weight = np.where(level.frame == frame, np.float32(0.0), level.frames.weight)
+        means.append(fitted(replace(level, frames=replace(level.frames, weight=weight)), 0.02).mean[:3])
+    off = np.array(means) - np.mean(means, axis=0)
+    count = len(means)
+    expected = np.sqrt((off**2).sum(axis=0) * (count - 1) / count)
+    # The covariance adds what parts of the image do, and takes three steps at the width of all edges.
+    spread = np.sqrt(deletion_covariance(level, fit, PLACES, PRIOR).diagonal()[:3])
+    assert (spread > 0.5 * expected).all()
+    assert (spread < 2.0 * expected).all()
+
+
+def test_a_covariance_under_another_prior_is_as_it_is_fitted_there(level: AssumedEdges) -> None:
+    wide, free = PRIOR.copy(), list(PLACES)
+    wide[list(LENS)] *= 2.0
+    fit = fitted(level)
+    expected = fit_gaussian(level, fit.mean, PLACES, wide, SHARE, effort=PRECISE, share_is_known=True).covariance
+    covariance = covariance_under(fit, PLACES, PRIOR, wide)
+    assert covariance is not None
+    sigma = np.sqrt(covariance.diagonal())
+    assert (sigma > 1.01 * np.sqrt(fit.covariance.diagonal()[free])).any()
+    np.testing.assert_allclose(sigma, np.sqrt(expected.diagonal()[free]), rtol=0.15)
 
 
 @pytest.mark.parametrize("broken", [np.nan, np.inf])

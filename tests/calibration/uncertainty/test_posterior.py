@@ -218,7 +218,7 @@ def test_frames_that_repeat_one_view_have_few_independent_edges(rng: np.random.G
     noisy = [corner_pixels([at])[0] + rng.normal(0.0, 1.0, (len(at), 2)) for at in once]
     repeated = measured(corner_edge_levels([seen] * CORNER_FRAMES, [view] * CORNER_FRAMES), still)
     different = measured(corner_edge_levels(noisy, once), still)
-    assert repeated.independent_share < 0.5 * different.independent_share
+    assert repeated.independent_share < 0.75 * different.independent_share
 
 
 def test_an_uncertain_lens_makes_the_pose_uncertain(rng: np.random.Generator) -> None:

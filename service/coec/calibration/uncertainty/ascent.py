@@ -38,7 +38,7 @@ TOLERANCE, LEADING = 0.02, 0.1
 there (see `gaussian`)."""
 
 METRIC_POINTS = 1_000
-"""Range edges from which the coordinates of an ascent are made."""
+"""Most range edges of which a metric is made."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +49,7 @@ class Coordinates:
         at: (13,) the point.
         places: n places in a deviation.
         axes: (n, n) the coordinates' directions, in columns.
-        edges: the edges as a function of the coordinates.
+        edges: the edges as a function of the places.
         prior: (n,) standard deviations of the places.
         share: of the range edges that is independent.
     """
@@ -63,19 +63,13 @@ class Coordinates:
 
     @classmethod
     def about(
-        cls,
-        level: AssumedEdges,
-        at: Vector,
-        places: tuple[int, ...],
-        prior: Vector,
-        share: float,
-        points: int = METRIC_POINTS,
+        cls, level: AssumedEdges, at: Vector, places: tuple[int, ...], prior: Vector, share: float
     ) -> "Coordinates":
-        """The coordinates of some places about a deviation (13,), made from about so many range edges."""
+        """The coordinates of some places about a deviation (13,)."""
         edges, of_places = level.at(at, places), prior[list(places)]
-        curvature = CURVATURE_PX2 * metric(edges, points) + np.diag(1.0 / of_places**2)
+        curvature = CURVATURE_PX2 * metric(edges) + np.diag(1.0 / of_places**2)
         axes = inverse_root(curvature)
-        return cls(at, places, axes, edges.along(axes), of_places, share)
+        return cls(at, places, axes, edges, of_places, share)
 
     def deviation(self, x: Vector) -> Vector:
         """(13,) that of coordinates x (n,)."""
@@ -85,22 +79,25 @@ class Coordinates:
 
     def log_posterior(self, x: Vector) -> tuple[float, Vector, float]:
         """The log-posterior at x (n,), up to a constant, its gradient (n,), and z."""
-        z, slope = self.edges.significance(x)
-        off = self.deviation(x)[list(self.places)] / self.prior
+        step = np.einsum("ij,j->i", self.axes, x)
+        z, slope = self.edges.significance(step)
+        off = (self.at[list(self.places)] + step) / self.prior
         value = 0.5 * self.share * max(z, 0.0) ** 2 - 0.5 * float(np.einsum("i,i", off, off))
-        gradient = self.share * max(z, 0.0) * slope - np.einsum("ij,i->j", self.axes, off / self.prior)
-        return value, gradient, z
+        of_places = self.share * max(z, 0.0) * slope - off / self.prior
+        return value, np.einsum("ij,i->j", self.axes, of_places), z
 
 
-def metric(edges: DisplacedEdges, at_most: int = METRIC_POINTS) -> NDArray[np.float64]:
-    """(n, n) mean products of how the parameters of some edges move them, px² per units, from about `at_most` edges."""
-    some = thinned(len(edges.weight), at_most)
+def metric(edges: DisplacedEdges) -> NDArray[np.float64]:
+    """(n, n) mean products of how the parameters of the edges move them, px² per units."""
+    some = thinned(len(edges.weight), METRIC_POINTS)
     jacobian, weight, uv_px = edges.jacobian[:, :, some].astype(np.float64), edges.weight[some], edges.uv_px[:, some]
     height, width = edges.maps.shape[1:]
     inside = (uv_px >= 0.0).all(axis=0) & (uv_px < np.array([[width], [height]])).all(axis=0)
     weight = np.where(inside, weight, 0.0).astype(np.float64)
     whole = max(float(weight.sum()), LEAST_SQUARE)
-    products = np.einsum("kie,lie->kl", jacobian * weight, jacobian) / whole
+    # Rows in one piece: NumPy then multiplies them in vector registers.
+    rows = jacobian.reshape(len(jacobian), -1)
+    products = np.einsum("ke,le->kl", (jacobian * weight).reshape(rows.shape), rows) / whole
     return np.asarray(0.5 * (products + products.T))
 
 

@@ -55,12 +55,14 @@ class AssumedEdges:
         pose: (4, 4) from which deviations are counted.
         passing: (3, E) how fast standing things pass the LiDAR, m/s, LiDAR frame.
         share: (3, E) the share of each clock's error at each range edge; 0 without ego-motion.
+        frame: (E,) int32 the frame of each.
     """
 
     frames: EdgeFrames
     pose: Matrix4
     passing: NDArray[np.float32]
     share: NDArray[np.float32]
+    frame: NDArray[np.int32]
 
     def at(self, deviation: NDArray[np.float64], places: Sequence[int]) -> DisplacedEdges:
         """The edges as a linear function of some places of a deviation (13,), about that deviation."""
@@ -77,7 +79,7 @@ class AssumedEdges:
             float(deviation[LENS[3]]),
             tuple(places),
         )
-        return DisplacedEdges(uv_px, jacobian, self.frames.weight, self.frames.first_point, self.frames.maps)
+        return DisplacedEdges(uv_px, jacobian, self.frames.weight, self.frame, self.frames.maps)
 
     def _camera(self, deviation: NDArray[np.float64]) -> Camera:
         camera, (right, down, longer, _) = self.frames.camera, deviation[LENS].tolist()
@@ -101,7 +103,7 @@ def assumed_levels(edges: Sequence[EdgeFrames], window: Window, pose: Matrix4) -
 def _assumed_edges(frames: EdgeFrames, window: Window, pose: Matrix4) -> AssumedEdges:
     """The range edges of one level of a window at `pose` (4, 4)."""
     counts, pairs = np.diff(frames.first_point), window.pairs
-    frame = np.repeat(np.arange(len(pairs)), counts)
+    frame = np.repeat(np.arange(len(pairs), dtype=np.int32), counts)
     velocity, turn, moves = np.zeros((len(pairs), 3)), np.zeros((len(pairs), 3)), np.zeros(len(pairs))
     for index, pair in enumerate(pairs):
         if pair.motion is not None:
@@ -114,7 +116,7 @@ def _assumed_edges(frames: EdgeFrames, window: Window, pose: Matrix4) -> Assumed
     p_camera = np.einsum("ij,nj->ni", pose[:3, :3], xyz_m) + pose[:3, 3]
     row = np.clip(project(frames.camera, p_camera)[0][:, 1] / frames.camera.height - 0.5, -0.5, 0.5)
     share = moves[frame] * np.stack([np.ones(len(frame)), elapsed[frame], row])
-    return AssumedEdges(frames, pose, passing.T.astype(np.float32, order="C"), share.astype(np.float32))
+    return AssumedEdges(frames, pose, passing.T.astype(np.float32, order="C"), share.astype(np.float32), frame)
 
 
 def moves(window: Window) -> bool:

@@ -32,7 +32,16 @@ from coec.calibration.uncertainty.displaced_edges import (
     assumed_levels,
     moves,
 )
-from coec.calibration.uncertainty.gaussian import PRECISE, ROUGH, GaussianFit, deletion_covariance, fit_gaussian
+from coec.calibration.uncertainty.gaussian import (
+    NEAR,
+    PRECISE,
+    ROUGH,
+    GaussianFit,
+    covariance_under,
+    deletion_covariance,
+    fit_gaussian,
+    upper_bound,
+)
 from coec.geometry import linalg
 from coec.geometry.edges.alignment import EdgeFrames
 
@@ -302,6 +311,10 @@ ADMISSIBLE = 4.0
 """A hypothesis is also tried about the general optimum, as far as that is within so many standard deviations of its
 prior."""
 
+NEGLIGIBLE = 3e-3
+"""A hypothesis that is at most this probable, by an upper bound, is taken at the bound: it adds a twentieth of its
+distance to σ."""
+
 
 def _fits(
     levels: Sequence[AssumedEdges], places: tuple[int, ...], priors: Mapping[str, Vector]
@@ -311,45 +324,86 @@ def _fits(
     Raises:
         ValueError: the edges in view determine no pose.
     """
-    sharp, wide = levels[-1], np.max(list(priors.values()), axis=0)
+    sharp, of_nominal = levels[-1], priors[NOMINAL]
     general = _general_optimum(levels, places, priors)
-
-    def fit(start: Vector, prior: Vector, share: float | None, steps: int) -> GaussianFit:
-        guess = GENERAL_SHARE if share is None else share
-        return fit_gaussian(sharp, start, places, prior, guess, steps=steps, share_is_known=share is not None)
-
-    try:
-        nominal = fit(np.zeros(SIZE), priors[NOMINAL], None, PRECISE)
-        gain = 0.5 * GENERAL_SHARE * (general.significance**2 - nominal.significance**2)
-        fits_well = gain <= AS_GOOD
-    except ValueError:
-        fits_well = False
-    if not fits_well:
-        best = fit(general.deviation, wide, None, PRECISE)
-        nominal = fit(np.zeros(SIZE), priors[NOMINAL], best.independent_share, PRECISE)
-    covariance = nominal.covariance + deletion_covariance(sharp, nominal, places, priors[NOMINAL])
-    nominal = replace(nominal, covariance=covariance)
-    share, fits = nominal.independent_share, [(NOMINAL, nominal)]
+    nominal = _nominal(sharp, general, places, priors)
+    with_deletion = nominal.covariance + deletion_covariance(sharp, nominal, places, of_nominal)
+    fits = [(NOMINAL, replace(nominal, covariance=with_deletion))]
     for name, prior in priors.items():
-        if name == NOMINAL:
-            continue
-        admissible = np.abs(general.deviation) <= ADMISSIBLE * prior
-        end = ascent(levels[-1:], np.where(admissible, general.deviation, 0.0), places, prior, share)
-        off = (nominal.mean / prior)[list(places)]
-        of_nominal = 0.5 * share * nominal.significance**2 - 0.5 * float(np.sum(off * off))
-        start = end.deviation if end.log_posterior > of_nominal else nominal.mean
-        fits.append((name, fit(start, prior, share, ROUGH)))
+        if name != NOMINAL:
+            fits.append((name, _alternative(levels, name, general, nominal, places, of_nominal, prior)))
     start = np.zeros(SIZE)
     start[: SHIFTS.stop] = general.deviation[: SHIFTS.stop]
-    end = ascent(levels[-2:], start, places, priors[NOMINAL], share)
-    other = fit(end.deviation, priors[NOMINAL], share, ROUGH)
-    posed = slice(0, SHIFTS.stop)
-    away = (other.mean - nominal.mean)[posed] / np.sqrt(nominal.covariance.diagonal()[posed])
-    if float(np.max(np.abs(away))) >= SAME_MODE:
+    share = nominal.independent_share
+    end = ascent(levels[-2:], start, places, of_nominal, share)
+    sigma = np.sqrt(with_deletion.diagonal()[: SHIFTS.stop])
+    least = nominal.log_posterior + log(NEGLIGIBLE)
+    if end.log_posterior < least or not _is_away(end.deviation, nominal.mean, sigma):
+        return fits
+    other = fit_gaussian(sharp, end.deviation, places, of_nominal, share, effort=ROUGH, share_is_known=True)
+    if _is_away(other.mean, nominal.mean, sigma):
         # As wide as the nominal mode: edges that fit nothing are wide, and are no mode.
         evidence = nominal.log_evidence + other.log_posterior - nominal.log_posterior
         fits.append((OTHER_MODE, replace(other, log_evidence=evidence)))
     return fits
+
+
+def _is_away(deviation: Vector, mean: Vector, sigma: Vector) -> bool:
+    """Whether the pose of a deviation (13,) is another mode than that of a mean (13,) with standard deviations (6,)."""
+    return float(np.max(np.abs((deviation - mean)[: SHIFTS.stop]) / sigma)) >= SAME_MODE
+
+
+def _nominal(
+    sharp: AssumedEdges, general: Ascent, places: tuple[int, ...], priors: Mapping[str, Vector]
+) -> GaussianFit:
+    """The nominal Gaussian, with the share of independent edges at it, or at the general optimum if that fits better.
+
+    Raises:
+        ValueError: the edges in view determine no pose.
+    """
+
+    def fit(start: Vector, prior: Vector, share: float | None) -> GaussianFit:
+        guess, known = GENERAL_SHARE if share is None else share, share is not None
+        return fit_gaussian(sharp, start, places, prior, guess, effort=PRECISE, share_is_known=known)
+
+    try:
+        nominal = fit(np.zeros(SIZE), priors[NOMINAL], None)
+        if 0.5 * GENERAL_SHARE * (general.significance**2 - nominal.significance**2) <= AS_GOOD:
+            return nominal
+    except ValueError:
+        pass
+    best = fit(general.deviation, np.max(list(priors.values()), axis=0), None)
+    return fit(np.zeros(SIZE), priors[NOMINAL], best.independent_share)
+
+
+def _alternative(
+    levels: Sequence[AssumedEdges],
+    name: str,
+    general: Ascent,
+    nominal: GaussianFit,
+    places: tuple[int, ...],
+    of_nominal: Vector,
+    prior: Vector,
+) -> GaussianFit:
+    """The Gaussian of another hypothesis than the nominal one, from the higher of two places: the mean of the nominal
+    Gaussian, and where an ascent from the general optimum ends, as far as that is admissible."""
+    share = nominal.independent_share
+    admissible = np.abs(general.deviation) <= ADMISSIBLE * prior
+    end = ascent(levels[-1:], np.where(admissible, general.deviation, 0.0), places, prior, share)
+    off = (nominal.mean / prior)[list(places)]
+    there = 0.5 * share * nominal.significance**2 - 0.5 * float(np.sum(off * off))
+    top = max(end, Ascent(nominal.mean, nominal.significance, there), key=lambda place: place.log_posterior)
+    # A place that is much higher is on another hill, of another width.
+    same_hill = top.log_posterior - there <= AS_GOOD
+    covariance = covariance_under(nominal, places, of_nominal, prior) if same_hill else None
+    if covariance is not None:
+        bound = upper_bound(top, share, covariance, places, prior)
+        if bound.log_evidence + log(ODDS[name] / ODDS[NOMINAL] / NEGLIGIBLE) < nominal.log_evidence:
+            return bound
+    effort = ROUGH if covariance is None else NEAR
+    return fit_gaussian(
+        levels[-1], top.deviation, places, prior, share, effort=effort, share_is_known=True, covariance=covariance
+    )
 
 
 def log_odds(probability: float) -> float:

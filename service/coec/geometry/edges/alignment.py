@@ -282,7 +282,7 @@ def _between(
     numbers, places, strengths = block
     u, v, place = numbers[0, :n], numbers[1, :n], places[:n]
     _pixels(camera, T, x_m, y_m, z_m, u, v)
-    _split(camera.width, camera.height, u, v, place)
+    split_pixels(camera.width, camera.height, u, v, place)
     p, q, r, s = strengths[0, :n], strengths[1, :n], strengths[2, :n], strengths[3, :n]
     for i in range(n):
         here = np.uint64(max(place[i], 0))
@@ -294,7 +294,9 @@ def _between(
 
 
 @njit(cache=True)
-def _split(width: int, height: int, u: NDArray[np.float32], v: NDArray[np.float32], place: NDArray[np.int32]) -> None:
+def split_pixels(
+    width: int, height: int, u: NDArray[np.float32], v: NDArray[np.float32], place: NDArray[np.int32]
+) -> None:
     """Splits pixel coordinates (n,): writes the pixel above and to the left (row · width + column) into `place`, -1 if
     there is none, and leaves the fractions in `u` and `v`. Without a branch, as `_pixels`."""
     right, bottom, zero = np.float32(width - 1), np.float32(height - 1), np.float32(0.0)

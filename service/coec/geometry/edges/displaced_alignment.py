@@ -5,21 +5,22 @@ they have J, cost about as much for any number of parameters, and give the gradi
 linearises again where it ends.
 
 Arrays have the edges last: blocks of `BLOCK` edges go through each step together, sixteen numbers to an instruction.
-Sums are taken in an order that does not depend on the processor.
+`CHUNK` edges are read from memory once for all points, and their sums are added in the order of the chunks, so that
+results depend neither on the processor nor on the number of threads.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coec.geometry.cameras import Camera, project_point
 from coec.geometry.compiler import PRANGE, njit, prange
-from coec.geometry.edges.alignment import LEAST_SQUARE
+from coec.geometry.edges.alignment import LEAST_SQUARE, split_pixels
 from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID
 
-BLOCK = 64
+BLOCK, CHUNK = 256, 1024
 
 STEP = 1e-3
 """Difference step, as a share of the range by which a point is shifted: about a pixel or less."""
@@ -39,51 +40,68 @@ class DisplacedEdges:
         uv_px: (2, E) float32 pixels at the point of linearisation.
         jacobian: (n, 2, E) float32 pixels per unit of each parameter.
         weight: (E,) float32.
-        first_point: (F + 1,) int64, frames one after the other.
+        frame: (E,) int32 index of the map of each edge.
         maps: (F, h, w) int8, as in `EdgePyramid`.
     """
 
     uv_px: NDArray[np.float32]
     jacobian: NDArray[np.float32]
     weight: NDArray[np.float32]
-    first_point: NDArray[np.int64]
+    frame: NDArray[np.int32]
     maps: NDArray[np.int8]
-
-    def along(self, axes: NDArray[np.float64]) -> "DisplacedEdges":
-        """The same edges as a function of coordinates along `axes` (n, m), columns in the space of the parameters."""
-        jacobian = np.einsum("kie,kn->nie", self.jacobian, axes.astype(np.float32))
-        return replace(self, jacobian=np.ascontiguousarray(jacobian))
 
     def significance(self, x: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         """z at the parameters x (n,), and its gradient (n,). What leaves the view does not count in the gradient."""
-        z, gradients = self.gradients_at(x[None])
-        return float(z[0]), gradients[0]
+        z, gradients = of_sums(self._sums(np.zeros_like(x), x[None], 1, with_gradients=True))
+        return float(z[0, 0]), gradients[0, 0]
 
     def significances(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """(K,) z at K points (K, n), without gradients."""
-        sums = np.cumsum(_sums_at(*self._arguments, points.astype(np.float32), False), axis=1)[:, -1]
-        return np.asarray(sums[:, 0] / np.sqrt(np.maximum(sums[:, 1], LEAST_SQUARE)))
+        sums = self._sums(np.zeros_like(points[0]), points, 1, with_gradients=False)
+        return np.asarray(of_sums(sums)[0][0])
 
-    def gradients_at(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(K,) z at K points (K, n), and (K, n) its gradients."""
-        sums = np.cumsum(_sums_at(*self._arguments, points.astype(np.float32), True), axis=1)[:, -1]
-        root = np.sqrt(np.maximum(sums[:, 1], LEAST_SQUARE))
-        return sums[:, 0] / root, sums[:, 2:] / root[:, None]
+    def gradients_across(
+        self, centre: NDArray[np.float64], offsets: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(2, K) z at a point (n,) plus each of K offsets (K, n), and at the point minus each; and (2, K, n) its
+        gradients."""
+        return of_sums(self._sums(centre, offsets, 2, with_gradients=True))
 
-    def gradients_of_cells(
-        self, cell: NDArray[np.uint8], cells: int, x: NDArray[np.float64], along: int
+    def cell_sums(
+        self, cell: NDArray[np.int64], cells: int, points: NDArray[np.float64], along: int
     ) -> NDArray[np.float64]:
-        """(m, F, cells) what the range edges of each frame and cell add to the gradient of z at x (n,), along the first
-        m parameters (`along`); `cell` (E,) is the cell of each."""
-        sums = _sums_of_cells(*self._arguments, cell, cells, x.astype(np.float32), along)
-        root = math.sqrt(max(float(np.cumsum(sums[:, :, 0].ravel())[-1]), LEAST_SQUARE))
-        return np.moveaxis(sums[:, :, 1:], 2, 0) / root
+        """(K, cells, 2 + m): Σ w·e, Σ w², and the gradient of the first along the first m parameters (`along`), of the
+        range edges of each cell at K points (K, n); `cell` (E,) is the cell of each."""
+        return np.asarray(_sums_of_cells(*self._arguments, cell, cells, points.astype(np.float32), along))
+
+    def _sums(
+        self, centre: NDArray[np.float64], offsets: NDArray[np.float64], sides: int, *, with_gradients: bool
+    ) -> NDArray[np.float64]:
+        single = centre.astype(np.float32), offsets.astype(np.float32)
+        of_chunks = _sums_at(*self._arguments, *single, sides, with_gradients)
+        # One chunk after the other; NumPy would add pairs.
+        return np.cumsum(of_chunks, axis=0)[-1] if len(of_chunks) else np.zeros(of_chunks.shape[1:])
 
     @property
     def _arguments(
         self,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.int64], NDArray[np.int8]]:
-        return self.uv_px, self.jacobian, self.weight, self.first_point, self.maps
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.int32], NDArray[np.int8]]:
+        return self.uv_px, self.jacobian, self.weight, self.frame, self.maps
+
+
+def of_sums(sums: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """z (...) and its gradients (..., n) from sums (..., 2 + n)."""
+    root = np.sqrt(np.maximum(sums[..., 1], LEAST_SQUARE))
+    return sums[..., 0] / root, sums[..., 2:] / root[..., None]
+
+
+Scratch = tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int8]]
+
+
+@njit(cache=True)
+def _scratch() -> Scratch:
+    """Memory for a block of edges: (4, BLOCK) and (BLOCK,) numbers, and (4, BLOCK) strengths."""
+    return np.empty((4, BLOCK), np.float32), np.empty(BLOCK, np.int32), np.empty((4, BLOCK), np.int8)
 
 
 @njit(cache=True, parallel=PRANGE, error_model="numpy")
@@ -91,39 +109,47 @@ def _sums_at(
     uv: NDArray[np.float32],
     jacobian: NDArray[np.float32],
     weight: NDArray[np.float32],
-    first_point: NDArray[np.int64],
+    frame: NDArray[np.int32],
     maps: NDArray[np.int8],
-    points: NDArray[np.float32],
-    with_gradient: bool,
+    centre: NDArray[np.float32],
+    offsets: NDArray[np.float32],
+    sides: int,
+    with_gradients: bool,
 ) -> NDArray[np.float64]:
-    """(K, F, 2 + n): Σ w·e, Σ w² and the gradient of the first (0 without), of each frame at points (K, n)."""
-    frames, n = first_point.shape[0] - 1, points.shape[1]
-    sums = np.zeros((points.shape[0], frames, 2 + n))
-    for task in prange(points.shape[0] * frames):
-        # Frame by frame, so that its map stays in the cache.
-        f, k = task // points.shape[0], task % points.shape[0]
-        u, v = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-        lanes = np.zeros((n, BLOCK), np.float32)
-        strength, square = 0.0, 0.0
-        for first in range(first_point[f], first_point[f + 1], BLOCK):
-            count = min(BLOCK, first_point[f + 1] - first)
-            _displace(uv, jacobian, points[k], first, count, u, v)
-            for i in range(count):
-                w = weight[first + i]
-                seen, value, across, down = _interpolated(maps[f], u[i], v[i])
-                if seen:
-                    strength += w * value
-                    square += w * w
-                u[i], v[i] = w * across, w * down
-            if with_gradient:
-                for j in range(n):
-                    _add_slopes(jacobian, j, first, count, u, v, lanes[j])
-        sums[k, f, 0], sums[k, f, 1] = strength / STRENGTH_STEPS, square
-        for j in range(n):
-            total = 0.0
-            for i in range(BLOCK):
-                total += lanes[j, i]
-            sums[k, f, 2 + j] = total / STRENGTH_STEPS
+    """(chunks, sides, K, 2 + n): Σ w·e, Σ w² and the gradient of the first (0 without) of each chunk of edges, at
+    `centre` (n,) plus K offsets (K, n); on a second side at `centre` minus these."""
+    edges, n = weight.shape[0], centre.shape[0]
+    chunks = (edges + CHUNK - 1) // CHUNK
+    sums = np.zeros((chunks, sides, offsets.shape[0], 2 + n))
+    for chunk in prange(chunks):
+        begin, scratch = chunk * CHUNK, _scratch()
+        size = min(CHUNK, edges - begin)
+        at, off = np.empty((2, size), np.float32), np.empty((2, size), np.float32)
+        # One sum for each place in a block, so that they are added in vector registers.
+        lanes = np.empty((sides, 2 + n, BLOCK), np.float32)
+        at[:] = uv[:, begin : begin + size]
+        _displace(at[0], at[1], jacobian, begin, centre)
+        for k in range(offsets.shape[0]):
+            off[:] = np.float32(0.0)
+            lanes[:] = np.float32(0.0)
+            _displace(off[0], off[1], jacobian, begin, offsets[k])
+            for first in range(0, size, BLOCK):
+                last = min(first + BLOCK, size)
+                of_edges = slice(begin + first, begin + last)
+                for side in range(sides):
+                    u, v, strength, square = _rows(scratch, last - first)
+                    sign = np.float32(1.0 - 2.0 * side)
+                    _moved(at[0, first:last], off[0, first:last], sign, u)
+                    _moved(at[1, first:last], off[1, first:last], sign, v)
+                    _interpolate(u, v, weight[of_edges], frame[of_edges], maps, scratch, strength, square)
+                    _add(strength, lanes[side, 0])
+                    _add(square, lanes[side, 1])
+                    if with_gradients:
+                        for j in range(n):
+                            _add_slopes(jacobian[j, 0, of_edges], jacobian[j, 1, of_edges], u, v, lanes[side, 2 + j])
+            for side in range(sides):
+                for j in range(2 + n):
+                    sums[chunk, side, k, j] = _folded(lanes[side, j]) / (1.0 if j == 1 else STRENGTH_STEPS)
     return sums
 
 
@@ -132,87 +158,134 @@ def _sums_of_cells(
     uv: NDArray[np.float32],
     jacobian: NDArray[np.float32],
     weight: NDArray[np.float32],
-    first_point: NDArray[np.int64],
+    frame: NDArray[np.int32],
     maps: NDArray[np.int8],
-    cell: NDArray[np.uint8],
+    cell: NDArray[np.int64],
     cells: int,
-    x: NDArray[np.float32],
+    points: NDArray[np.float32],
     along: int,
 ) -> NDArray[np.float64]:
-    """(F, cells, 1 + m): Σ w² and the gradient of Σ w·e along the first m parameters, of each frame and cell at x."""
-    frames = first_point.shape[0] - 1
-    sums = np.zeros((frames, cells, 1 + along))
-    for f in prange(frames):
-        u, v = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-        for first in range(first_point[f], first_point[f + 1], BLOCK):
-            count = min(BLOCK, first_point[f + 1] - first)
-            _displace(uv, jacobian, x, first, count, u, v)
-            for i in range(count):
-                w, of_cell = weight[first + i], sums[f, cell[first + i]]
-                seen, _, across, down = _interpolated(maps[f], u[i], v[i])
-                if not seen:
-                    continue
-                of_cell[0] += w * w
-                across, down = w * across / np.float32(STRENGTH_STEPS), w * down / np.float32(STRENGTH_STEPS)
+    """(K, cells, 2 + m): Σ w·e, Σ w² and the gradient of the first along the first m parameters, of the edges of each
+    cell at points (K, n)."""
+    edges = weight.shape[0]
+    sums = np.zeros((points.shape[0], cells, 2 + along))
+    # With the parameters last they are added in vector registers; edges of a block belong to any cell.
+    slopes = np.empty((edges, 2, along), np.float32)
+    for j in range(along):
+        slopes[:, :, j] = jacobian[j].T
+    for k in prange(points.shape[0]):
+        scratch, at = _scratch(), uv.copy()
+        _displace(at[0], at[1], jacobian, 0, points[k])
+        for first in range(0, edges, BLOCK):
+            last = min(first + BLOCK, edges)
+            _, _, strength, square = _rows(scratch, last - first)
+            u, v = at[0, first:last], at[1, first:last]
+            _interpolate(u, v, weight[first:last], frame[first:last], maps, scratch, strength, square)
+            for i in range(last - first):
+                of_cell = sums[k, cell[first + i]]
+                of_cell[0] += strength[i]
+                of_cell[1] += square[i]
+                across, down = slopes[first + i, 0], slopes[first + i, 1]
                 for j in range(along):
-                    of_cell[1 + j] += across * jacobian[j, 0, first + i] + down * jacobian[j, 1, first + i]
+                    of_cell[2 + j] += u[i] * across[j] + v[i] * down[j]
+        sums[k, :, 0] /= STRENGTH_STEPS
+        sums[k, :, 2:] /= STRENGTH_STEPS
     return sums
+
+
+@njit(cache=True)
+def _rows(
+    scratch: Scratch, count: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Four rows (count,) of numbers, each in one piece, so that loops over them run in vector registers."""
+    numbers = scratch[0]
+    return numbers[0, :count], numbers[1, :count], numbers[2, :count], numbers[3, :count]
 
 
 @njit(cache=True, error_model="numpy")
 def _displace(
-    uv: NDArray[np.float32],
-    jacobian: NDArray[np.float32],
-    x: NDArray[np.float32],
-    first: int,
-    count: int,
+    u: NDArray[np.float32], v: NDArray[np.float32], jacobian: NDArray[np.float32], begin: int, x: NDArray[np.float32]
+) -> None:
+    """Moves the pixels (count,) of the edges from `begin` on by the parameters x (n,)."""
+    end = begin + u.shape[0]
+    for j in range(x.shape[0]):
+        across, down, xj = jacobian[j, 0, begin:end], jacobian[j, 1, begin:end], x[j]
+        if xj == 0.0:
+            continue
+        for i in range(u.shape[0]):
+            u[i] += across[i] * xj
+        for i in range(v.shape[0]):
+            v[i] += down[i] * xj
+
+
+@njit(cache=True)
+def _moved(at: NDArray[np.float32], off: NDArray[np.float32], sign: np.float32, to: NDArray[np.float32]) -> None:
+    for i in range(to.shape[0]):
+        to[i] = at[i] + sign * off[i]
+
+
+@njit(cache=True, error_model="numpy")
+def _interpolate(
     u: NDArray[np.float32],
     v: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    frame: NDArray[np.int32],
+    maps: NDArray[np.int8],
+    scratch: Scratch,
+    strength: NDArray[np.float32],
+    square: NDArray[np.float32],
 ) -> None:
-    """Writes the pixels of a block of edges at x (n,) into u and v."""
+    """Writes w·e, in steps, and w² of edges (count,) at pixels (u, v), and in place of these the slopes of w·e across
+    and down. Zero if one of the four pixels around does not count. Runs in passes: look-ups go edge by edge,
+    calculations run in vector registers."""
+    _, places, corners = scratch
+    count, edges = u.shape[0], maps.ravel()
+    height, width = maps.shape[1:]
+    place = places[:count]
+    split_pixels(width, height, u, v, place)
+    p, q, r, s = corners[0, :count], corners[1, :count], corners[2, :count], corners[3, :count]
+    whole, row, one = np.uint64(height * width), np.uint64(width), np.uint64(1)
     for i in range(count):
-        u[i], v[i] = uv[0, first + i], uv[1, first + i]
-    for j in range(x.shape[0]):
-        across, down, xj = jacobian[j, 0, first : first + count], jacobian[j, 1, first : first + count], x[j]
-        for i in range(count):
-            u[i] += across[i] * xj
-        for i in range(count):
-            v[i] += down[i] * xj
+        here = np.uint64(frame[i]) * whole + np.uint64(max(place[i], 0))
+        below = here + row
+        p[i], q[i], r[i], s[i] = edges[here], edges[here + one], edges[below], edges[below + one]
+    for i in range(count):
+        seen = (place[i] >= 0) & (p[i] != VOID) & (q[i] != VOID) & (r[i] != VOID) & (s[i] != VOID)
+        over, under = np.float32(q[i]) - np.float32(p[i]), np.float32(s[i]) - np.float32(r[i])
+        upper, lower = np.float32(p[i]) + u[i] * over, np.float32(r[i]) + u[i] * under
+        w = weight[i] if seen else np.float32(0.0)
+        strength[i], square[i] = w * (upper + v[i] * (lower - upper)), w * w
+        u[i], v[i] = w * (over + v[i] * (under - over)), w * (lower - upper)
+
+
+@njit(cache=True)
+def _add(values: NDArray[np.float32], lanes: NDArray[np.float32]) -> None:
+    for i in range(values.shape[0]):
+        lanes[i] += values[i]
 
 
 @njit(cache=True, error_model="numpy")
 def _add_slopes(
-    jacobian: NDArray[np.float32],
-    j: int,
-    first: int,
-    count: int,
+    of_u: NDArray[np.float32],
+    of_v: NDArray[np.float32],
     across: NDArray[np.float32],
     down: NDArray[np.float32],
     lanes: NDArray[np.float32],
 ) -> None:
-    """Adds what a block of edges contributes to the gradient along parameter j, one lane for each place in a block."""
-    of_u, of_v = jacobian[j, 0, first : first + count], jacobian[j, 1, first : first + count]
-    for i in range(count):
+    """Adds what edges (count,) contribute to the gradient along a parameter, from how it moves their pixels."""
+    for i in range(across.shape[0]):
         lanes[i] += across[i] * of_u[i] + down[i] * of_v[i]
 
 
-@njit(cache=True, error_model="numpy")
-def _interpolated(
-    edges: NDArray[np.int8], u: np.float32, v: np.float32
-) -> tuple[bool, np.float32, np.float32, np.float32]:
-    """Whether the four pixels around a place count, the strength there in steps, and its slopes across and down."""
-    none = np.float32(0.0)
-    if not (u >= 0.0 and v >= 0.0 and u < edges.shape[1] - 1 and v < edges.shape[0] - 1):
-        return False, none, none, none
-    column, row = int(u), int(v)
-    p, q = edges[row, column], edges[row, column + 1]
-    r, s = edges[row + 1, column], edges[row + 1, column + 1]
-    if p == VOID or q == VOID or r == VOID or s == VOID:
-        return False, none, none, none
-    right, below = u - np.float32(column), v - np.float32(row)
-    over, under = np.float32(q) - np.float32(p), np.float32(s) - np.float32(r)
-    upper, lower = np.float32(p) + right * over, np.float32(r) + right * under
-    return True, upper + below * (lower - upper), over + below * (under - over), lower - upper
+@njit(cache=True)
+def _folded(lanes: NDArray[np.float32]) -> float:
+    """The sum of the lanes, halved until one is left."""
+    width = BLOCK // 2
+    while width > 0:
+        for i in range(width):
+            lanes[i] += lanes[width + i]
+        width //= 2
+    return float(lanes[0])
 
 
 def linearised(
@@ -277,23 +350,7 @@ def _linearised(
                 for k in range(3):
                     p[row] += pose[row, k] * (xyz_m[k, i] + late_s * passing[k, i])
                     passing_m[row] += pose[row, k] * passing[k, i]
-            u, v, seen = project_point(camera, p[0], p[1], p[2])
-            step_m = max(STEP * math.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]), 1e-9)
-            for axis in range(3):
-                right, below, seen_ahead = project_point(
-                    camera,
-                    p[0] + (step_m if axis == 0 else 0.0),
-                    p[1] + (step_m if axis == 1 else 0.0),
-                    p[2] + (step_m if axis == 2 else 0.0),
-                )
-                left, above, seen_behind = project_point(
-                    camera,
-                    p[0] - (step_m if axis == 0 else 0.0),
-                    p[1] - (step_m if axis == 1 else 0.0),
-                    p[2] - (step_m if axis == 2 else 0.0),
-                )
-                seen = seen and seen_ahead and seen_behind
-                follows[0, axis], follows[1, axis] = (right - left) / (2.0 * step_m), (below - above) / (2.0 * step_m)
+            u, v, seen = _projected(camera, p, follows)
             x, y = u - camera.cx, v - camera.cy
             if not (seen and _is_near(camera, u, v)):
                 uv[0, i] = uv[1, i] = OUT_OF_VIEW_PX
@@ -319,6 +376,23 @@ def _linearised(
                 else:
                     jacobian[j, 0, i], jacobian[j, 1, i] = outward * x, outward * y
     return uv, jacobian
+
+
+@njit(cache=True, error_model="numpy")
+def _projected(camera: Camera, p: NDArray[np.float64], follows: NDArray[np.float64]) -> tuple[float, float, bool]:
+    """The pixel of a point (3,), and whether it is seen. Writes how that moves with the point into `follows` (2, 3),
+    pixels per metre."""
+    u, v, seen = project_point(camera, p[0], p[1], p[2])
+    step_m = max(STEP * math.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]), 1e-9)
+    for axis in range(3):
+        x_m = step_m if axis == 0 else 0.0
+        y_m = step_m if axis == 1 else 0.0
+        z_m = step_m if axis == 2 else 0.0
+        right, below, seen_ahead = project_point(camera, p[0] + x_m, p[1] + y_m, p[2] + z_m)
+        left, above, seen_behind = project_point(camera, p[0] - x_m, p[1] - y_m, p[2] - z_m)
+        seen = seen and seen_ahead and seen_behind
+        follows[0, axis], follows[1, axis] = (right - left) / (2.0 * step_m), (below - above) / (2.0 * step_m)
+    return u, v, seen
 
 
 @njit(cache=True, error_model="numpy")

@@ -49,7 +49,7 @@ def late_kernels(camera: Camera) -> tuple[Callable[[], object], ...]:
     edges, pose = one_edge(camera), np.eye(4)
     two = np.stack([pose, pose])
     displaced = DisplacedEdges(
-        np.zeros((2, 1), np.float32), np.zeros((1, 2, 1), np.float32), edges.weight, edges.first_point, edges.maps
+        np.zeros((2, 1), np.float32), np.zeros((1, 2, 1), np.float32), edges.weight, np.zeros(1, np.int32), edges.maps
     )
     still = np.zeros((3, 1), np.float32)
     charts = edge_charts(camera, edges.maps, BLUR_RAD, edges.xyz_m, edges.weight, np.zeros(1, np.int64))
@@ -59,7 +59,7 @@ def late_kernels(camera: Camera) -> tuple[Callable[[], object], ...]:
     return (
         lambda: alignment.ascend(edges, [alignment.AscentStart(pose, 0, 1)], pose[None, None]),
         lambda: displaced.significances(np.zeros((2, 1))),
-        lambda: displaced.gradients_of_cells(np.zeros(1, np.uint8), 1, np.zeros(1), 1),
+        lambda: displaced.cell_sums(np.zeros(1, np.int64), 1, np.zeros((1, 1)), 1),
         lambda: linearised(camera, camera, pose, np.zeros(3), edges.xyz_m, still, still, np.zeros(3), 0.0, (0,)),
         lambda: pattern_search(charts, two, steps, 1, pose, reach),
         lambda: charted_significances(charts, two),
