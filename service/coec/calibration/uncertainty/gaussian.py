@@ -71,7 +71,7 @@ class Effort:
     tolerance: float
 
 
-PRECISE, ROUGH, NEAR = Effort(4, 60, 0.01), Effort(2, 12, 0.1), Effort(2, 7, 0.1)
+PRECISE, ROUGH, NEAR = Effort(4, 60, 0.002), Effort(2, 12, 0.1), Effort(2, 7, 0.1)
 """For what is reported to a few hundredths; for the odds of a hypothesis; and for these if the covariance is about
 known. See docs/measured.md."""
 
