@@ -50,6 +50,7 @@ def recorder_of(
     neighbour = SnippetRecorder(RIG, {"vehicle": "test"}, snippets, losses, packed=True)
     recording = RecordingThread()
     recorder = Recorder(PLAN, windows, losses, recording, lambda _, event: recorded.append(event.window_id), neighbour)
+    recording.join(recorder)
     return recording, recorder, neighbour, losses
 
 

@@ -103,6 +103,7 @@ class CameraLidarPair:
         self.engine.publish()
         self._do(self.engine.take_actions())
         vehicle.join(self)
+        context.recording.join(self.recorder)  # last, because it posts events to this pair
 
     def reconfigure(self, pair: PairConfig, stale_after_s: float, history_text: str) -> None:
         """Goes on with other settings, which differ only in what `configuration.RELOADED` names. `history_text` is the

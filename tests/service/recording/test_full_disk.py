@@ -50,6 +50,7 @@ class Life:
         self.lost: list[str] = []
         self.recording = RecordingThread()
         self.recorder = Recorder(PLAN, self.store, self.losses, self.recording, self.post)
+        self.recording.join(self.recorder)
         self.recording.thread.start()
 
     def post(self, pair: str, event: WindowRecorded | WindowLost) -> None:

@@ -75,6 +75,7 @@ class Bench:
         self.lost: list[str] = []
         self.recording = RecordingThread()
         self.recorder = Recorder(plan, store, self.losses, self.recording, self.post)
+        self.recording.join(self.recorder)
 
     def post(self, pair: str, event: WindowRecorded | WindowLost) -> None:
         """What the engine does, but for the solve."""
@@ -360,7 +361,7 @@ def test_a_window_cannot_be_removed_while_it_is_handed_over(tmp_path: Path) -> N
     writer.add(pair(10))
     writer.finish()
     recording = RecordingThread()
-    Recorder(PLAN, bench.store, bench.losses, recording, post)
+    recording.join(Recorder(PLAN, bench.store, bench.losses, recording, post))
     recording.thread.start()
     event = posted.get(timeout=DEADLINE_S)
     recording.request_stop()

@@ -277,8 +277,8 @@ class Recorder:
         post: Callable[[str, WindowRecorded | WindowLost], None],
         snippets: SnippetRecorder | None = None,
     ) -> None:
-        """`post(pair, event)` hands over an event for each window that ended. `snippets` are written between the
-        frame pairs."""
+        """The recorder works once it has joined `recording`. `post(pair, event)` hands over an event for each window
+        that ended. `snippets` are written between the frame pairs."""
         self._plan = plan
         self._configuration = plan.configuration
         self._store = store
@@ -298,7 +298,6 @@ class Recorder:
         self.recorded = 0
         self.writing_took = Histogram(QUICK_S)
         self._problem: Reason | None = None
-        recording.join(self)
 
     @property
     def problem(self) -> Reason | None:
