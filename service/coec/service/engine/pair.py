@@ -20,13 +20,13 @@ from coec.calibration import state as lifecycle
 from coec.calibration.monitor.change_detector import MonitorOutcome, holds_at_rest
 from coec.calibration.state import PairRules, PairState
 from coec.calibration.state_machine import HealthState
-from coec.calibration.types import Decision, FramePair, Reason
+from coec.calibration.types import Decision, FramePair, Matrix4, Reason
 from coec.config import PairConfig
 from coec.geometry import se3
 from coec.io.logs import LossCounter
 from coec.io.serialise import check_of, estimate_of, matrix_of
 from coec.reports.formatting import hold_text
-from coec.schemas.replies import CalibrationResult, CheckReply
+from coec.schemas.replies import CalibrationResult, CheckReply, EvidenceEvent
 from coec.service.engine.check_progress import Attempts, CheckProgress
 from coec.service.engine.frame_selector import GRACE_S, FrameSelector
 from coec.service.engine.messages import (
@@ -503,17 +503,10 @@ class Pair:
         if not np.array_equal(before.T_camera_lidar, after.T_camera_lidar):
             self._latest_check = None
             self._member.serves(None if request is None else request.due_ns, after)
-        red, event = HealthState.MISCALIBRATED, self.store.incidents.newest
-        if after.health is red and before.health is not red and event is not None and event.window_before is not None:
-            # Nothing else than the window before the event is known at that time.
-            self._actions.append(
-                SubmitPicture(
-                    PictureSubject(event.event_id, "before"),
-                    event.window_before,
-                    (matrix_of(event.camera_from_lidar),),
-                    (f"{event.window_before}  at {SERVED_CAPTION}",),
-                )
-            )
+        event = self.store.incidents.newest
+        red = HealthState.MISCALIBRATED
+        if after.health is red and before.health is not red and event is not None:
+            self._render_beginning(event, after)
         return _selection_change(taken, by_check=by_check)
 
     def _with_calibration(self, change: SelectionChange | None) -> SelectionChange:
@@ -531,10 +524,29 @@ class Pair:
             return
         event = self.store.incidents.add_window_after(result.window_id)
         self.store.protect()
-        if event is None:
-            return
-        poses = (matrix_of(event.camera_from_lidar), matrix_of(result.camera_from_lidar))
-        captions = (SERVED_CAPTION, f"found by the window after it ({result.verdict.decision})")
+        if event is not None:
+            self._render_both_sides(event, matrix_of(result.camera_from_lidar), result.verdict.decision)
+
+    def _render_beginning(self, event: EvidenceEvent, state: PairState) -> None:
+        """A red event has begun. If a window has caused it, that is the window after it; else nothing but the window
+        before it is known, which is rendered at the served extrinsic."""
+        latest = state.latest
+        if latest is not None and event.window_after == latest.window_id:
+            self._render_both_sides(event, latest.optimum.T_camera_lidar, latest.verdict.decision.value)
+        elif event.window_before is not None:
+            self._actions.append(
+                SubmitPicture(
+                    PictureSubject(event.event_id, "before"),
+                    event.window_before,
+                    (matrix_of(event.camera_from_lidar),),
+                    (f"{event.window_before}  at {SERVED_CAPTION}",),
+                )
+            )
+
+    def _render_both_sides(self, event: EvidenceEvent, estimated: Matrix4, decision: str) -> None:
+        """Has the windows before and after an event rendered, each at the served and at the estimated extrinsic."""
+        poses = (matrix_of(event.camera_from_lidar), estimated)
+        captions = (SERVED_CAPTION, f"found by the window after it ({decision})")
         for side, window_id in (("before", event.window_before), ("after", event.window_after)):
             if window_id is not None:
                 subject = PictureSubject(event.event_id, "before" if side == "before" else "after")
