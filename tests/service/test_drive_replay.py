@@ -100,7 +100,9 @@ def test_a_log_is_read_as_it_was_written_and_that_of_a_vehicle_too(
     vehicle = read_log(tmp_path / "live", PAIR)
     assert {decision.kind for decision in vehicle} == {"check", "estimate", "extrinsic", "state"}
     files = sorted(path.name for path in (tmp_path / "live").iterdir())
-    with pytest.raises(SourceError, match="no records of a pair rear"):
+    with pytest.raises(
+        SourceError, match="no records of a pair rear; it has those of front: give the service's --config"
+    ):
         read_log(tmp_path / "live", "rear")
     assert files == sorted(path.name for path in (tmp_path / "live").iterdir()), "it is only read"
 

@@ -107,7 +107,9 @@ def _of_state_directory(folder: Path, pair: str) -> tuple[Decision, ...]:
         checks = CheckLog(Path(copies) / f"checks-{pair}.jsonl", MOST_CHECKS)
         decisions = decisions_of(PairRecords(history.entries(), checks.checks(), ()))
     if not decisions:
-        raise SourceError(f"{folder} holds no records of a pair {pair}")
+        others = sorted(file.stem.removeprefix("checks-") for file in folder.glob("checks-*.jsonl"))
+        hint = f"; it has those of {', '.join(others)}: give the service's --config" if others else ""
+        raise SourceError(f"{folder} holds no records of a pair {pair}{hint}")
     return decisions
 
 
