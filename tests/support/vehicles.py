@@ -277,6 +277,17 @@ class InstantRecorder:
         self._post = post
         self._stamps: list[int] = []
 
+    has_work = False
+
+    def work(self) -> bool:
+        return False
+
+    def work_in_idle_time(self) -> bool:
+        return False
+
+    def close(self) -> None:
+        """Nothing is open."""
+
     def follow(self, plan: RecordingPlan) -> None:
         self.plan = plan
 

@@ -328,15 +328,14 @@ def _show_differences(differing: tuple[Difference, ...], against: Path, first_ns
 def _explain(replayed: ReplayedDrive, first_ns: int, moment_s: float) -> None:
     """Prints the steps of the engine around a moment of the drive."""
     from coec.reports import console
-    from coec.service.replay_page import transition_text
 
     table = console.table("s", "event", "actions", "health")
     for one in replayed.transitions:
         at_s = (one.stamp_ns - first_ns) / NS_PER_S
         if abs(at_s - moment_s) <= AROUND_S:
-            event, actions = transition_text(one)
             before, after = one.health
-            table.add_row(f"{at_s:.1f}", event, actions, after if before == after else f"{before} to {after}")
+            health = after if before == after else f"{before} to {after}"
+            table.add_row(f"{at_s:.1f}", one.event, ", ".join(one.actions) or "none", health)
     if not table.row_count:
         raise UsageError(f"the engine did nothing within {AROUND_S:g} s of {moment_s:g} s")
     console.out.print(table)

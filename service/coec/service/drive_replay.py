@@ -9,13 +9,15 @@ which it counts, so two replays are equal to the byte whatever the machine does.
 from __future__ import annotations
 
 import queue
+import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
+from coec.calibration.frames.window import SliceClosed
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import BudgetConfig, Config
 from coec.errors import SourceError
@@ -23,6 +25,7 @@ from coec.io.disk_writer import DiskWriter
 from coec.io.msgpack_frames import encode_camera, encode_ego, encode_lidar
 from coec.io.zenoh.bus import MSGPACK, InputSample
 from coec.io.zenoh.ros_node import RosTopicList
+from coec.reports.formatting import count
 from coec.schemas.keys import Keys
 from coec.service.camera_lidar_pair import CameraLidarPair
 from coec.service.cpu_budget import Budget
@@ -31,9 +34,13 @@ from coec.service.engine.messages import (
     Action,
     Evaluate,
     Event,
+    JobDone,
     JobSubject,
     PairRequest,
+    RecordBetween,
+    RecordPair,
     SensorTime,
+    SubmitCheck,
     Tick,
     WindowSubject,
 )
@@ -82,9 +89,9 @@ class DriveClock(Clock):
         return self.stamp_ns
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class Transition:
-    """A step of the engine that did something.
+    """A step of the engine that did something. It is text, because the frames of its event must not stay in memory.
 
     Attributes:
         stamp_ns: sensor time of the drive.
@@ -93,8 +100,8 @@ class Transition:
     """
 
     stamp_ns: int
-    event: Event
-    actions: tuple[Action, ...]
+    event: str
+    actions: tuple[str, ...]
     health: tuple[str, str]
 
 
@@ -206,7 +213,8 @@ class _ReplayedPair(CameraLidarPair):
         health = (before, self.engine.store.state.health.value)
         idle = not actions if isinstance(event, SensorTime | Evaluate) else isinstance(event, Tick)
         if not idle or health[0] != health[1]:
-            self.transitions.append(Transition(self._context.vehicle.clock.wall_ns(), event, tuple(actions), health))
+            stamp_ns = self._context.vehicle.clock.wall_ns()
+            self.transitions.append(Transition(stamp_ns, _event_text(event), tuple(_action_texts(actions)), health))
         self._do(actions)
 
     def end_slice(self) -> None:
@@ -295,6 +303,9 @@ class DriveReplay:
             self._recording.request_stop()
             self._disk_writer.request_stop()
             joined([self._recording.thread, self._disk_writer.thread], STOP_S)
+        for thread in (self._recording.thread, self._disk_writer.thread):
+            if thread.failure is not None:
+                raise SourceError(f"The thread {thread.name} died: {thread.failure!r}.")
 
     def _settle(self) -> None:
         """Has the engine do all that it may, and waits for the results that it waits for."""
@@ -332,3 +343,33 @@ def _packed(frame: Frame) -> tuple[str, bytes]:
             return LIDAR, encode_lidar(frame)
         case EgoMotion():
             return EGO, encode_ego(frame)
+
+
+def _event_text(event: Event) -> str:
+    match event:
+        case Evaluate():
+            return "frame pair"
+        case JobDone(subject=WindowSubject() as subject):
+            return f"window {subject.window_id} solved: {event.outcome.fate.value}"
+        case JobDone():
+            return f"job ended: {event.outcome.fate.value}"
+        case _:
+            return _type_label(event)
+
+
+def _type_label(value: object) -> str:
+    """The name of a type in words: `RecordPair` is `record pair`."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(value).__name__).lower()
+
+
+def _action_texts(actions: Sequence[Action]) -> Iterator[str]:
+    for action in actions:
+        match action:
+            case RecordPair() | RecordBetween():
+                yield f"{_type_label(action)} for {action.window_id}"
+            case SliceClosed():
+                yield f"end of {action.window_id} with {count(action.pairs, 'pair')}"
+            case SubmitCheck():
+                yield f"check of {count(len(action.pairs), 'pair')}, counts from {action.request.due_ns} ns"
+            case _:
+                yield _type_label(action)

@@ -1,17 +1,13 @@
 """What a replay of a drive decided, for people to read: lines of a table, and a page."""
 
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from coec.calibration.frames.window import SliceClosed
 from coec.reports.formatting import count
 from coec.reports.page import Facts, Page, Section, Table, Text, write
 from coec.service.decision_log import Decision, Difference
-from coec.service.drive_replay import ReplayedDrive, Transition
-from coec.service.engine.messages import Evaluate, JobDone, RecordBetween, RecordPair, SubmitCheck, WindowSubject
+from coec.service.drive_replay import ReplayedDrive
 from coec.service.timing import NS_PER_S
 
 
@@ -56,41 +52,6 @@ def _text(decision: Decision) -> str:
             return "" if values["window_id"] is None else f"by {values['window_id']}"
         case _:
             return ""
-
-
-def transition_text(transition: Transition) -> tuple[str, str]:
-    """An event and its actions, in words."""
-    return _event_text(transition.event), ", ".join(_action_texts(transition.actions)) or "none"
-
-
-def _event_text(event: Any) -> str:
-    match event:
-        case Evaluate():
-            return "frame pair"
-        case JobDone(subject=WindowSubject() as subject):
-            return f"window {subject.window_id} solved: {event.outcome.fate.value}"
-        case JobDone():
-            return f"job ended: {event.outcome.fate.value}"
-        case _:
-            return _type_label(event)
-
-
-def _type_label(value: object) -> str:
-    """The name of a type in words: `RecordPair` is `record pair`."""
-    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(value).__name__).lower()
-
-
-def _action_texts(actions: Sequence[Any]) -> Iterator[str]:
-    for action in actions:
-        match action:
-            case RecordPair() | RecordBetween():
-                yield f"{_type_label(action)} for {action.window_id}"
-            case SliceClosed():
-                yield f"end of {action.window_id} with {count(action.pairs, 'pair')}"
-            case SubmitCheck():
-                yield f"check of {count(len(action.pairs), 'pair')}, counts from {action.request.due_ns} ns"
-            case _:
-                yield _type_label(action)
 
 
 def write_replay_page(
