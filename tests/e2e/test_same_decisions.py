@@ -153,6 +153,12 @@ def states(decided: dict[str, Any]) -> list[tuple[str, str]]:
     return [(entry["code"], entry["text"]) for entry in decided["entries"] if entry["kind"] == "state"]
 
 
+def seen_states(decided: dict[str, Any]) -> list[str]:
+    """States that data have caused: after a start nothing has been checked, and a last window may come too late."""
+    entries = [entry for entry in decided["entries"] if entry["kind"] == "state" and entry["stamp_ns"] is not None]
+    return [entry["code"] for entry in entries if entry["code"] != "unknown"]
+
+
 @pytest.mark.slow
 def test_live_restarted_and_replayed_the_decisions_are_the_same(
     tmp_path: Path, drive: Drive, router: Router, sample_data: Path
@@ -203,7 +209,7 @@ def test_live_restarted_and_replayed_the_decisions_are_the_same(
         restarted = decisions(running)
         assert drive.error_deg(running.extrinsic(), SECONDS) < MAX_ERROR_DEG
         assert running.terminate() == 0
-    assert [code for code, _ in states(restarted)] == [code for code, _ in states(live)]
+    assert seen_states(restarted) == seen_states(live)
 
 
 # --- the way in ---------------------------------------------------------------------------------------------------
