@@ -112,6 +112,7 @@ def _replay_window(window: Path, depth: str | None, *, as_json: bool) -> int:
     from coec.reports import console
     from coec.reports.console import StageTimes
     from coec.schemas.message import to_json
+    from coec.service.decision_log import value_differences
 
     recorded = read_result(window)
     if recorded is None:
@@ -125,7 +126,7 @@ def _replay_window(window: Path, depth: str | None, *, as_json: bool) -> int:
         )
     reached = comparable(result_of(estimate, recorded_window.rig, recorded.vehicle), recorded)
     identical = to_json(reached) == to_json(recorded)
-    differences = _value_differences(recorded.model_dump(mode="json"), reached.model_dump(mode="json"))
+    differences = list(value_differences(recorded.model_dump(mode="json"), reached.model_dump(mode="json")))
     if as_json:
         console.print_json(
             {
@@ -144,24 +145,6 @@ def _replay_window(window: Path, depth: str | None, *, as_json: bool) -> int:
             table.add_row(field, str(before), str(after))
         console.out.print(table)
     return 0 if identical else 1
-
-
-def _value_differences(recorded: Any, reached: Any, at: str = "") -> list[tuple[str, Any, Any]]:
-    """(place, recorded, reached) of every value that differs."""
-    if isinstance(recorded, dict) and isinstance(reached, dict):
-        keys = sorted(recorded.keys() | reached.keys())
-        return [
-            difference
-            for key in keys
-            for difference in _value_differences(recorded.get(key), reached.get(key), f"{at}.{key}" if at else key)
-        ]
-    if isinstance(recorded, list) and isinstance(reached, list) and len(recorded) == len(reached):
-        return [
-            difference
-            for index, (before, after) in enumerate(zip(recorded, reached, strict=True))
-            for difference in _value_differences(before, after, f"{at}[{index}]")
-        ]
-    return [] if recorded == reached else [(at, recorded, reached)]
 
 
 # --- a drive --------------------------------------------------------------------------------------------------------

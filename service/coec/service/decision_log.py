@@ -151,7 +151,8 @@ def differences(before: Sequence[Decision], after: Sequence[Decision]) -> tuple[
         if one is None or other is None:
             result.append(Difference(one, other))
         elif one.values != other.values:
-            result.append(Difference(one, other, tuple(_places(one.values, other.values))))
+            places = (place.partition("[")[0] for place, _, _ in value_differences(one.values, other.values))
+            result.append(Difference(one, other, tuple(dict.fromkeys(places))))
     return tuple(result)
 
 
@@ -167,9 +168,13 @@ def _keyed(decisions: Sequence[Decision]) -> dict[tuple[int, int, int], Decision
     return keyed
 
 
-def _places(before: Any, after: Any, at: str = "") -> Iterator[str]:
+def value_differences(before: Any, after: Any, at: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """(place, before, after) of every value that differs between two documents."""
     if isinstance(before, dict) and isinstance(after, dict):
         for key in sorted(before.keys() | after.keys()):
-            yield from _places(before.get(key), after.get(key), f"{at}.{key}" if at else str(key))
+            yield from value_differences(before.get(key), after.get(key), f"{at}.{key}" if at else str(key))
+    elif isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
+        for index, (one, other) in enumerate(zip(before, after, strict=True)):
+            yield from value_differences(one, other, f"{at}[{index}]")
     elif before != after:
-        yield at
+        yield at, before, after

@@ -19,7 +19,7 @@ from typing import cast
 
 from coec.calibration.frames.window import SliceClosed
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
-from coec.config import BudgetConfig, Config
+from coec.config import BudgetConfig, Config, PairConfig
 from coec.errors import SourceError
 from coec.io.disk_writer import DiskWriter
 from coec.io.msgpack_frames import encode_camera, encode_ego, encode_lidar
@@ -205,7 +205,9 @@ class _ReplayWorkers:
 class _ReplayedPair(CameraLidarPair):
     """Notes every step that does something."""
 
-    transitions: list[Transition]
+    def __init__(self, pair: PairConfig, config: Config, context: VehicleContext) -> None:
+        self.transitions: list[Transition] = []
+        super().__init__(pair, config, context)
 
     def _step(self, event: Event) -> None:
         before = self.engine.store.state.health.value
@@ -257,8 +259,6 @@ class DriveReplay:
             show=lambda *_: None,
             topics=RosTopicList,
         )
-        self._transitions: list[Transition] = []
-        _ReplayedPair.transitions = self._transitions
         self._pair = _ReplayedPair(config.pairs[0], config, context)
 
     def run(self, frames: Iterator[Frame], on_frame: Callable[[int], None]) -> ReplayedDrive:
@@ -284,7 +284,7 @@ class DriveReplay:
         store = self._pair.engine.store
         return ReplayedDrive(
             decisions_of(PairRecords(store.history.entries(), store.checks(), ())),
-            tuple(self._transitions),
+            tuple(self._pair.transitions),
             self._pair.stream.losses(),
             health,
             begin_ns,

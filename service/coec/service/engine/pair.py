@@ -159,8 +159,10 @@ class Pair:
         return self._schedule.oldest
 
     def needs_tick(self, monotonic_s: float) -> bool:
-        """Whether the step `Tick` is due: something has changed or is unpublished, or time has passed."""
-        return self._has_changed or self.is_unpublished or monotonic_s - self._clocks_checked_s >= TICK_S
+        """Whether the step `Tick` is due: something has changed, what waits for the disk can be published, or
+        time has passed."""
+        can_publish = self.is_unpublished and self.store.may_be_published()
+        return self._has_changed or can_publish or monotonic_s - self._clocks_checked_s >= TICK_S
 
     def snapshot(self) -> PairSnapshot:
         """What is known now."""
