@@ -18,6 +18,7 @@ from coec.config import LimitsConfig
 from coec.errors import DecodeError
 from coec.geometry.cameras import Camera, intrinsics_of, name_of
 from coec.geometry.edges.range_edges import range_edges
+from coec.geometry.edges.scan_lines import scan_lines
 from coec.geometry.points import thinned
 from coec.geometry.projection import points_in_view
 from coec.io.frame_validation import Refusal
@@ -333,7 +334,7 @@ def marks_of(
 def silhouettes_of(sweep: LidarFrame) -> NDArray[np.bool_]:
     """(N,) which points of an uncompensated sweep lie on the near side of a range jump."""
     silhouette = np.zeros(len(sweep.xyz_m), np.bool_)
-    silhouette[range_edges(sweep.xyz_m, sweep.ring).index] = True
+    silhouette[range_edges(scan_lines(sweep.xyz_m, sweep.ring)).index] = True
     return silhouette
 
 

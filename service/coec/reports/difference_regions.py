@@ -23,6 +23,7 @@ from coec.geometry import se3
 from coec.geometry.cameras import Camera, in_image
 from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID, EdgeScales, Rectangle
 from coec.geometry.edges.range_edges import range_edges
+from coec.geometry.edges.scan_lines import scan_lines
 from coec.geometry.projection import project, unproject
 from coec.geometry.sweep_kernels import Bearings, bearings
 
@@ -50,7 +51,7 @@ class Outlines:
 
     Attributes:
         xyz_m: (E, 3) float32, LiDAR frame, at the instant of the exposure.
-        weight: (E,) float32, as `RangeEdges` has it.
+        weight: (E,) float32, as `SweepEdges` has it.
         pieces: (L, 2) the lower and the upper edge of each piece of an outline.
         outline: (L,) the outline that each piece belongs to, as the index of its lowest edge.
     """
@@ -71,7 +72,7 @@ class ProjectedOutlines:
 
 def outlines_of(pair: FramePair, rig: Rig, *, compensated: bool) -> Outlines:
     """The outlines of the sweep of a pair; none where the sweep has no jump in range."""
-    edges = range_edges(pair.lidar.xyz_m, pair.lidar.ring)
+    edges = range_edges(scan_lines(pair.lidar.xyz_m, pair.lidar.ring))
     # Found as measured, placed motion-compensated, as the estimator does.
     xyz_m = compensate(pair, rig, enabled=compensated, selection=edges.index) + edges.shift_m
     joined = _joined(xyz_m)

@@ -21,6 +21,7 @@ from coec.geometry.cameras import Camera, name_of, pixel_rad
 from coec.geometry.cameras.double_sphere_fit import residual
 from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID, EdgeScales, Rectangle
 from coec.geometry.edges.range_edges import range_edges
+from coec.geometry.edges.scan_lines import scan_lines
 from coec.geometry.projection import points_in_view, project, unproject
 from coec.io.images import GreyImages, decode_grey
 from coec.reports import drawing
@@ -156,7 +157,7 @@ class _ImageEdgePoints:
 
 
 def _placed(pair: FramePair, rig: Rig, T_camera_lidar: Matrix4, *, compensated: bool) -> _ImageEdgePoints:
-    edges = range_edges(pair.lidar.xyz_m, pair.lidar.ring)
+    edges = range_edges(scan_lines(pair.lidar.xyz_m, pair.lidar.ring))
     xyz_m = compensate(pair, rig, enabled=compensated, selection=edges.index) + edges.shift_m
     seen = points_in_view(rig.camera, T_camera_lidar, xyz_m, rig.mask, 0.0)
     nearest = np.clip(np.rint(seen.uv_px).astype(np.int64), 0, (rig.camera.width - 1, rig.camera.height - 1))

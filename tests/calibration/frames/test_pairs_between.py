@@ -11,7 +11,8 @@ from coec.calibration.frames.window import BetweenPairs, thinned_sweep
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame
 from coec.config import WindowConfig
 from coec.errors import DecodeError
-from coec.geometry.edges.range_edges import NEIGHBOUR_RAD, range_edges
+from coec.geometry.edges.range_edges import range_edges
+from coec.geometry.edges.scan_lines import NEIGHBOUR_RAD, scan_lines
 
 S = 1_000_000_000
 FORWARD = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -111,7 +112,7 @@ def test_range_edges_of_a_thinned_sweep_are_edges_of_the_whole(numbered: bool) -
     places = {point.tobytes(): index for index, point in enumerate(whole.xyz_m)}
     index = np.array([places[point.tobytes()] for point in thinned.xyz_m])
     np.testing.assert_array_equal(thinned.time_offset_s, whole.time_offset_s[index])
-    of_whole, of_thinned = (range_edges(sweep.xyz_m, sweep.ring) for sweep in (whole, thinned))
+    of_whole, of_thinned = (range_edges(scan_lines(sweep.xyz_m, sweep.ring)) for sweep in (whole, thinned))
     result = set(index[of_thinned.index].tolist())
     assert result <= set(of_whole.index.tolist())
     # At the border of what is kept, a neighbour may be missing.

@@ -27,6 +27,7 @@ from coec.geometry.edges.alignment import EdgeFrames, significances
 from coec.geometry.edges.charts import CELLS_PER_BLUR, MAX_CHART_POINTS
 from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, STRENGTH_STEPS, VOID, EdgeScales
 from coec.geometry.edges.range_edges import range_edges
+from coec.geometry.edges.scan_lines import scan_lines
 from coec.geometry.projection import project, unproject
 from coec.io.images import GreyImages
 
@@ -99,7 +100,7 @@ def test_maps_are_those_of_the_images_with_strong_edges_cut_off(sharp_street: Wi
 def test_points_are_the_range_edges_where_they_were_at_the_exposure(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     first = sharp_edges.sharp.first_point
     for f, pair in enumerate(sharp_street.pairs):
-        result = range_edges(pair.lidar.xyz_m, pair.lidar.ring)
+        result = range_edges(scan_lines(pair.lidar.xyz_m, pair.lidar.ring))
         cloud = compensate(pair, sharp_street.rig, enabled=True)
         at_m = cloud[result.index] + result.shift_m
         np.testing.assert_array_equal(sharp_edges.sharp.xyz_m[:, first[f] : first[f + 1]].T, at_m)

@@ -5,6 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from coec.geometry.edges.range_edges import MAX_WEIGHT_M, SPILL_RAD, range_edges
+from coec.geometry.edges.scan_lines import scan_lines
 
 POLE_M, POLE_RADIUS_M, WALL_M = 6.0, 0.25, 15.0
 
@@ -42,7 +43,7 @@ def horizontal_m(xyz_m: NDArray[np.float32]) -> NDArray[np.float32]:
 @pytest.mark.parametrize("with_ring", [True, False])
 def test_a_pole_before_a_wall_has_two_edges_per_beam_and_the_wall_none(beams: int, with_ring: bool) -> None:
     xyz_m, ring = pole_before_wall(beams)
-    edges = range_edges(xyz_m, ring if with_ring else None)
+    edges = range_edges(scan_lines(xyz_m, ring if with_ring else None))
     assert np.bincount(ring[edges.index], minlength=beams).tolist() == [2] * beams
     result = xyz_m[edges.index]
     assert horizontal_m(result) == pytest.approx(POLE_M, abs=1e-3)
@@ -54,7 +55,7 @@ def test_a_pole_before_a_wall_has_two_edges_per_beam_and_the_wall_none(beams: in
 @pytest.mark.parametrize("beams", [16, 64, 128])
 def test_a_cloud_with_and_without_ring_agree(beams: int) -> None:
     xyz_m, ring = pole_before_wall(beams)
-    known, unknown = range_edges(xyz_m, ring), range_edges(xyz_m, None)
+    known, unknown = range_edges(scan_lines(xyz_m, ring)), range_edges(scan_lines(xyz_m, None))
     assert sorted(known.index) == sorted(unknown.index)
 
 
@@ -62,8 +63,8 @@ def test_a_cloud_with_and_without_ring_agree(beams: int) -> None:
 def test_the_order_of_the_points_does_not_matter(with_ring: bool) -> None:
     xyz_m, ring = pole_before_wall(64)
     shuffle = np.random.default_rng(1).permutation(len(xyz_m))
-    plain = range_edges(xyz_m, ring if with_ring else None)
-    shuffled = range_edges(xyz_m[shuffle], ring[shuffle] if with_ring else None)
+    plain = range_edges(scan_lines(xyz_m, ring if with_ring else None))
+    shuffled = range_edges(scan_lines(xyz_m[shuffle], ring[shuffle] if with_ring else None))
     a, b = np.argsort(plain.index), np.argsort(shuffle[shuffled.index])
     np.testing.assert_array_equal(plain.index[a], shuffle[shuffled.index][b])
     np.testing.assert_array_equal(plain.shift_m[a], shuffled.shift_m[b])
@@ -76,7 +77,7 @@ def edges_of_beams(columns_deg: float, spill_rad: float, phase: float) -> NDArra
     azimuth = np.radians(np.arange(-30.0, 30.0, columns_deg)) + phase * np.radians(columns_deg)
     near = np.abs(azimuth) < 0.1 + spill_rad
     xyz_m = placed(azimuth, np.zeros(len(azimuth)), np.where(near, POLE_M, WALL_M))
-    edges = range_edges(xyz_m, np.zeros(len(azimuth), np.uint16))
+    edges = range_edges(scan_lines(xyz_m, np.zeros(len(azimuth), np.uint16)))
     at_m = xyz_m[edges.index] + edges.shift_m
     assert np.linalg.norm(at_m, axis=1) == pytest.approx(POLE_M, rel=1e-6)
     return np.asarray(np.arctan2(at_m[:, 1], at_m[:, 0]))
@@ -105,18 +106,18 @@ def test_what_is_thinner_than_two_columns_is_one_edge_where_it_was_measured(with
     azimuth, elevation, ring = rays(16)
     on_pole = np.abs(azimuth - azimuth[225]) < np.radians(0.1)
     xyz_m = placed(azimuth, elevation, np.where(on_pole, POLE_M, WALL_M))
-    edges = range_edges(xyz_m, ring if with_ring else None)
+    edges = range_edges(scan_lines(xyz_m, ring if with_ring else None))
     assert sorted(edges.index) == np.flatnonzero(on_pole).tolist()
     assert (edges.shift_m == 0.0).all()
 
 
 def test_the_weight_is_the_root_of_the_jump_up_to_a_cap() -> None:
     xyz_m, ring = pole_before_wall(1, pole_m=10.0, wall_m=11.5)
-    edges = range_edges(xyz_m, ring)
+    edges = range_edges(scan_lines(xyz_m, ring))
     range_m = np.linalg.norm(xyz_m, axis=1)
     jumps_m = [max(range_m[i - 1], range_m[i + 1]) - range_m[i] for i in edges.index]
     assert edges.weight == pytest.approx(np.sqrt(jumps_m), rel=1e-5)
-    far = range_edges(*pole_before_wall(1))
+    far = range_edges(scan_lines(*pole_before_wall(1)))
     assert far.weight == pytest.approx(np.sqrt(MAX_WEIGHT_M))
 
 
@@ -124,7 +125,7 @@ def test_the_weight_is_the_root_of_the_jump_up_to_a_cap() -> None:
 def test_a_step_below_half_a_metre_or_a_twentieth_of_the_range_is_no_edge(pole_m: float, wall_m: float) -> None:
     xyz_m, ring = pole_before_wall(16, pole_m, wall_m)
     ahead = np.abs(np.arctan2(xyz_m[:, 1], xyz_m[:, 0])) < np.radians(3.0)
-    assert len(range_edges(xyz_m[ahead], ring[ahead]).index) == 0
+    assert len(range_edges(scan_lines(xyz_m[ahead], ring[ahead])).index) == 0
 
 
 def test_a_level_ground_has_no_edges() -> None:
@@ -132,8 +133,8 @@ def test_a_level_ground_has_no_edges() -> None:
     azimuth, elevation, ring = rays(64)
     down = elevation < np.radians(-2.0)
     ground = placed(azimuth[down], elevation[down], -1.8 / np.tan(elevation[down]))
-    assert len(range_edges(ground, ring[down]).index) == 0
-    assert len(range_edges(ground, None).index) == 0
+    assert len(range_edges(scan_lines(ground, ring[down])).index) == 0
+    assert len(range_edges(scan_lines(ground, None)).index) == 0
 
 
 def test_beyond_a_hole_is_no_neighbour() -> None:
@@ -142,17 +143,17 @@ def test_beyond_a_hole_is_no_neighbour() -> None:
     half_width_rad = POLE_RADIUS_M / POLE_M
     azimuth = np.abs(np.arctan2(xyz_m[:, 1], xyz_m[:, 0]))
     retained = (azimuth < half_width_rad) | (azimuth > half_width_rad + np.radians(1.5))
-    assert len(range_edges(xyz_m[retained], ring[retained]).index) == 0
+    assert len(range_edges(scan_lines(xyz_m[retained], ring[retained])).index) == 0
 
 
 def test_the_vehicle_itself_has_no_edges() -> None:
     xyz_m, ring = pole_before_wall(16, pole_m=1.5)
-    assert len(range_edges(xyz_m, ring).index) == 0
+    assert len(range_edges(scan_lines(xyz_m, ring)).index) == 0
 
 
 @pytest.mark.parametrize("ring", [None, np.zeros(0, np.uint16)])
 def test_an_empty_cloud_has_no_edges(ring: NDArray[np.uint16] | None) -> None:
-    edges = range_edges(np.zeros((0, 3), np.float32), ring)
+    edges = range_edges(scan_lines(np.zeros((0, 3), np.float32), ring))
     assert edges.index.shape == (0,)
     assert edges.weight.shape == (0,)
 
@@ -164,7 +165,10 @@ def test_which_way_a_sensor_turns_and_where_it_begins_changes_nothing(started: i
     per_ring = len(ring) // 16
     turned = np.roll(np.arange(per_ring)[::step], started)
     order = (np.arange(16)[:, None] * per_ring + turned).ravel()
-    known, other = range_edges(xyz_m, ring), range_edges(np.ascontiguousarray(xyz_m[order]), ring[order])
+    known, other = (
+        range_edges(scan_lines(xyz_m, ring)),
+        range_edges(scan_lines(np.ascontiguousarray(xyz_m[order]), ring[order])),
+    )
     assert sorted(order[other.index]) == sorted(known.index)
     at = np.argsort(order[other.index])
     np.testing.assert_allclose(other.shift_m[at], known.shift_m[np.argsort(known.index)], atol=1e-5)

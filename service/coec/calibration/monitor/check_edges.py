@@ -42,6 +42,7 @@ from coec.geometry.edges import alignment
 from coec.geometry.edges.charts import moved_by, select_separated, unit_ball
 from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, MEAN_RADIUS_PX, EdgeScales, Rectangle
 from coec.geometry.edges.range_edges import range_edges
+from coec.geometry.edges.scan_lines import scan_lines
 from coec.geometry.images import level_counts, neighbour_differences
 from coec.geometry.points import thinned
 from coec.geometry.projection import project
@@ -98,7 +99,7 @@ class PreparedSweep:
 
     Attributes:
         edges: the sweep reduced to its range edges, as measured.
-        weight: (E,) float32, weight of each range edge; see `RangeEdges`.
+        weight: (E,) float32, weight of each range edge; see `SweepEdges`.
         facts: what the sweep shows of the sensor itself.
     """
 
@@ -137,7 +138,7 @@ def prepare_sweep(sweep: LidarFrame) -> PreparedSweep:
     """The range edges of a sweep, and what the sweep shows of the LiDAR. Only these points are placed, and only later,
     because every pair places them at the instant of another exposure."""
     seen = bearings(sweep.xyz_m)
-    detected = range_edges(sweep.xyz_m, sweep.ring, seen)
+    detected = range_edges(scan_lines(sweep.xyz_m, sweep.ring, seen))
     offsets_s = None if sweep.time_offset_s is None else sweep.time_offset_s[detected.index]
     # The shift may come before motion compensation, which turns this tenth of a degree by two degrees at most.
     xyz_m = sweep.xyz_m[detected.index] + detected.shift_m

@@ -18,6 +18,7 @@ from coec.geometry.edges.alignment import Alignment, EdgeFrames, alignments, fra
 from coec.geometry.edges.charts import EdgeCharts, edge_charts
 from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, STRENGTH_STEPS, EdgeScales
 from coec.geometry.edges.range_edges import range_edges
+from coec.geometry.edges.scan_lines import scan_lines
 from coec.geometry.points import thinned
 from coec.geometry.projection import half_field_of_view_rad, within_cone
 from coec.geometry.sweep_kernels import bearings
@@ -141,7 +142,7 @@ def build_edges(pairs: Sequence[FramePair], points: Points, greys: Iterable[NDAr
     Raises:
         CalibrationError: no sweep has a range edge, or an image is not of the camera's size.
     """
-    detected = [range_edges(pair.lidar.xyz_m, pair.lidar.ring) for pair in pairs]
+    detected = [range_edges(scan_lines(pair.lidar.xyz_m, pair.lidar.ring)) for pair in pairs]
     first_point = np.concatenate([[0], np.cumsum([len(edges.index) for edges in detected])]).astype(np.int64)
     if first_point[-1] == 0:
         raise CalibrationError(

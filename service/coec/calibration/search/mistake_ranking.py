@@ -44,7 +44,8 @@ from coec.geometry.cameras import pixel_rad, scaled
 from coec.geometry.edges.alignment import AscentStart, EdgeFrames, alignments, ascend, frame_alignment, significances
 from coec.geometry.edges.charts import moved_by, unit_ball
 from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, EdgeScales
-from coec.geometry.edges.range_edges import RangeEdges, range_edges
+from coec.geometry.edges.range_edges import range_edges
+from coec.geometry.edges.scan_lines import SweepEdges, scan_lines
 from coec.geometry.points import thinned
 
 FRAMES = 8
@@ -152,7 +153,7 @@ class Edges:
     weight: NDArray[np.float32]
     first_point: NDArray[np.int64]
     maps: tuple[tuple[int, NDArray[np.int8]], ...]
-    detected: tuple[RangeEdges, ...]
+    detected: tuple[SweepEdges, ...]
 
     def seen_by(self, supposition: Supposition, number: int, points: int) -> EdgeFrames:
         """About `points` of them on one level."""
@@ -398,7 +399,7 @@ def _some_pairs(data: WindowData) -> WindowData:
     return replace(data, window=replace(data.window, pairs=tuple(pairs[index] for index in selected)))
 
 
-def _placed(data: WindowData, detected: Sequence[RangeEdges]) -> NDArray[np.float32]:
+def _placed(data: WindowData, detected: Sequence[SweepEdges]) -> NDArray[np.float32]:
     """(3, E) range edges of all pairs, motion-compensated."""
     placed = [data.points(frame, edges.index) + edges.shift_m for frame, edges in enumerate(detected)]
     return np.ascontiguousarray(np.concatenate(placed).T)
@@ -409,7 +410,7 @@ def _edges(data: WindowData) -> Edges | None:
     if len(data.window.pairs) < LEAST_PAIRS:
         return None
     part = _some_pairs(data)
-    detected = tuple(range_edges(pair.lidar.xyz_m, pair.lidar.ring) for pair in part.window.pairs)
+    detected = tuple(range_edges(scan_lines(pair.lidar.xyz_m, pair.lidar.ring)) for pair in part.window.pairs)
     first = np.concatenate([[0], np.cumsum([len(edges.index) for edges in detected])]).astype(np.int64)
     if first[-1] == 0:
         return None

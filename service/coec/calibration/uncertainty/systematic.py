@@ -23,7 +23,7 @@ from coec.calibration.types import LidarFrame, Matrix4, Window
 from coec.errors import LensError
 from coec.geometry.cameras import Camera, name_of, pixel_rad
 from coec.geometry.cameras.double_sphere_fit import DoubleSphereFit
-from coec.geometry.edges.range_edges import NEIGHBOUR_RAD
+from coec.geometry.edges.scan_lines import NEIGHBOUR_RAD
 from coec.geometry.linalg import inverted
 from coec.geometry.points import BAND_RAD, distinct_rings, thinned
 

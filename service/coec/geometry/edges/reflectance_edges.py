@@ -1,0 +1,194 @@
+"""Reflectance edges: where the reflectance of a surface jumps along a scan line, though its range does not. Paint, signs,
+plates, boards and joints of walls make such edges, and an image edge with each (METHOD, section 5).
+
+Five neighbours along a scan line form a step if they lie on one smooth surface: two before, the point, two after. Its
+height is the difference of the means of both sides. It counts as an edge if it is steep against the noise of this LiDAR
+at this level, if both sides are plateaus, and if no step next to it is higher. Its position between the neighbours
+follows from the value of the point in the middle, which the beam gathers from both sides.
+
+Every LiDAR has its own scale, quantisation and noise: calibrated values of 8 bits, or raw ones whose scatter grows with
+their level. So the noise is learned from the sweeps: the median height of all steps at a level, nearly all of which lie
+on surfaces without an edge.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.geometry.compiler import PRANGE, njit, prange
+from coec.geometry.edges.scan_lines import (
+    MAX_NEIGHBOURS_TRIED,
+    NEIGHBOUR_RAD,
+    ScanLines,
+    SweepEdges,
+    turned_about_the_axis,
+)
+
+SMOOTH_M, SMOOTH_SHARE = 0.05, 0.02
+"""Largest spread of the ranges of five neighbours on one surface: in metres, plus a share of the range."""
+
+LEAST_STEP = 5.0
+"""Least height of an edge, in standard deviations of steps without an edge."""
+
+PLATEAU_SHARE = 0.5
+"""Largest difference between the two points of a side, as a share of the height."""
+
+LEVELS = 24
+"""Levels of reflectance for which the noise is learned, each with as many steps as the others."""
+
+LEAST_STEPS = 50
+"""Least steps of a level."""
+
+MEDIAN_TO_SIGMA = 1.4826
+"""Standard deviation of a normal variable with the median magnitude 1."""
+
+MOST_VALUES = 4_096
+"""A LiDAR with more different values is not quantised."""
+
+QUANTISATION = math.sqrt(1.0 / 12.0)
+"""Standard deviation of a difference of two means of two values that are rounded to whole steps."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReflectanceSteps:
+    """Steps of reflectance at the points of a sweep, in the order of its scan lines.
+
+    Attributes:
+        lines: of the sweep.
+        height: (M,) float32; NaN where five neighbours lie on no smooth surface.
+        level: (M,) float32, the mean of both sides.
+        turn_rad: (M,) float32, from the point to the edge, azimuth.
+        highest: (M,) bool, whether both sides are plateaus and no step next to this one is higher.
+        quantum: the distance between neighbouring values of the sweep; 0 if it is not quantised.
+    """
+
+    lines: ScanLines
+    height: NDArray[np.float32]
+    level: NDArray[np.float32]
+    turn_rad: NDArray[np.float32]
+    highest: NDArray[np.bool_]
+    quantum: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReflectanceNoise:
+    """Standard deviations `sigma` (B,) of steps without an edge at ascending levels `level` (B,) of reflectance."""
+
+    level: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+
+    def at(self, level: NDArray[np.float32]) -> NDArray[np.float64]:
+        """(M,) at other levels (M,)."""
+        return np.asarray(np.interp(level, self.level, self.sigma))
+
+
+def reflectance_steps(lines: ScanLines, reflectance: NDArray[np.float32]) -> ReflectanceSteps:
+    """The steps of reflectance along the scan lines of a sweep; `reflectance` (N,) is in any unit."""
+    values = np.ascontiguousarray(reflectance, np.float32)
+    height, level, turn_rad, highest = _steps(
+        lines.first,
+        lines.azimuth,
+        lines.elevation,
+        lines.range_m,
+        values[lines.order],
+        lines.same_line_rad,
+        lines.one_line_per_row,
+    )
+    distinct = np.unique(values[np.isfinite(values)])
+    quantum = float(np.diff(distinct).min()) if 1 < len(distinct) <= MOST_VALUES else 0.0
+    return ReflectanceSteps(lines, height, level, turn_rad, highest, quantum)
+
+
+def learn_noise(sweeps: Sequence[ReflectanceSteps]) -> ReflectanceNoise | None:
+    """The noise of a LiDAR, from its sweeps; None if they have too few steps, or all of one value."""
+    finite = [np.isfinite(steps.height) for steps in sweeps]
+    height = np.concatenate([np.abs(steps.height[of]) for steps, of in zip(sweeps, finite, strict=True)])
+    level = np.concatenate([steps.level[of] for steps, of in zip(sweeps, finite, strict=True)])
+    if len(height) < LEAST_STEPS or not height.any():
+        return None
+    ascending = np.argsort(level, kind="stable")
+    parts = np.array_split(ascending, min(LEVELS, len(ascending) // LEAST_STEPS))
+    levels = np.array([np.median(level[part]) for part in parts])
+    sigma = MEDIAN_TO_SIGMA * np.array([np.median(height[part]) for part in parts], np.float64)
+    quantum = min(steps.quantum for steps in sweeps)
+    least = max(QUANTISATION * quantum, 1e-3 * float(np.ptp(levels)), 1e-9)
+    # Levels of one value, as zero often is, form several parts.
+    distinct, first = np.unique(levels, return_index=True)
+    return ReflectanceNoise(distinct, np.hypot(sigma[first], least))
+
+
+def reflectance_edges(steps: ReflectanceSteps, noise: ReflectanceNoise) -> SweepEdges:
+    """The edges among the steps of a sweep; all have weight 1."""
+    steep = np.abs(steps.height) > LEAST_STEP * noise.at(steps.level)
+    at = np.flatnonzero(steps.highest & steep)
+    index = steps.lines.order[at].astype(np.int64)
+    shift_m = turned_about_the_axis(steps.lines.xyz_m[index], steps.turn_rad[at])
+    return SweepEdges(index, shift_m, np.ones(len(index), np.float32))
+
+
+@njit(cache=True, parallel=PRANGE)
+def _steps(
+    first: NDArray[np.int64],
+    azimuth: NDArray[np.float32],
+    elevation: NDArray[np.float32],
+    range_m: NDArray[np.float32],
+    value: NDArray[np.float32],
+    same_line: float,
+    one_line_per_row: bool,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    count = azimuth.shape[0]
+    height, level = np.full(count, np.nan, np.float32), np.zeros(count, np.float32)
+    turn_rad, highest = np.zeros(count, np.float32), np.zeros(count, np.bool_)
+    following, previous = np.full(count, -1, np.int32), np.full(count, -1, np.int32)
+    for r in prange(first.shape[0] - 1):
+        begin, end = first[r], first[r + 1]
+        for k in range(begin, end):
+            for ahead in range(1, MAX_NEIGHBOURS_TRIED + 1):
+                j = k + ahead
+                if j >= end or azimuth[j] - azimuth[k] > NEIGHBOUR_RAD:
+                    break
+                if one_line_per_row or abs(elevation[j] - elevation[k]) < same_line:
+                    following[k] = j
+                    if previous[j] < 0:
+                        previous[j] = k
+                    break
+        for k in range(begin, end):
+            b, c = previous[k], following[k]
+            if b < 0 or c < 0:
+                continue
+            a, d = previous[b], following[c]
+            if a < 0 or d < 0:
+                continue
+            near = min(min(min(range_m[a], range_m[b]), min(range_m[c], range_m[d])), range_m[k])
+            far = max(max(max(range_m[a], range_m[b]), max(range_m[c], range_m[d])), range_m[k])
+            if far - near > SMOOTH_M + SMOOTH_SHARE * near:
+                continue
+            before, after = np.float32(0.5) * (value[a] + value[b]), np.float32(0.5) * (value[c] + value[d])
+            step = after - before
+            height[k], level[k] = step, np.float32(0.5) * (before + after)
+            if step == 0.0 or max(abs(value[b] - value[a]), abs(value[d] - value[c])) > PLATEAU_SHARE * abs(step):
+                continue
+            # The share of the beam that fell behind the edge moves it from the far side of the point to the near one.
+            share = min(max((value[k] - before) / step, np.float32(0.0)), np.float32(1.0))
+            turn_rad[k] = (np.float32(0.5) - share) * np.float32(0.5) * (azimuth[c] - azimuth[b])
+            highest[k] = True
+        for k in range(begin, end):
+            if highest[k]:
+                b, c = previous[k], following[k]
+                # Of equally high neighbours the first one counts.
+                highest[k] = not (
+                    _higher(height[previous[b]], height[k], True)
+                    or _higher(height[b], height[k], True)
+                    or _higher(height[c], height[k], False)
+                    or _higher(height[following[c]], height[k], False)
+                )
+    return height, level, turn_rad, highest
+
+
+@njit(cache=True, inline="always")
+def _higher(one: np.float32, other: np.float32, or_equal: bool) -> bool:
+    """Whether one step is higher than another, whatever their signs; a NaN is not."""
+    return abs(one) > abs(other) or (or_equal and abs(one) == abs(other))
