@@ -14,8 +14,14 @@ from numpy.typing import NDArray
 from coec.calibration.frames.ego_mask import MIN_FRAMES, MIN_SPEED_MPS, lit_pixels
 from coec.calibration.frames.motion_compensation import EVERY, Choice, compensate
 from coec.calibration.objective import mutual_information
-from coec.calibration.objective.edges import EdgeCue, build_edges, independent_samples_at
-from coec.calibration.objective.fused import Fusion
+from coec.calibration.objective.edges import (
+    RANGE,
+    REFLECTANCE,
+    EdgeCue,
+    build_edges,
+    independent_samples_at,
+)
+from coec.calibration.objective.fused import FusedObjective, Fusion
 from coec.calibration.search.global_search import at_rim, basin_next_to, find_basins
 from coec.calibration.search.local_search import SearchResult, box_of, maximise, near, polish_in_turn
 from coec.calibration.types import (
@@ -249,12 +255,18 @@ def by_fusion(data: WindowData, config: CalibrationConfig) -> EstimatorResult:
     features = depth_features(data, start, LEADING_DEPTH_POINTS)
     depth = mutual_information.build_mutual_information(features, window.rig, start, reach, config.objective)
     basins = find_basins(edges, start, reach)
+    if edges.count(REFLECTANCE) and edges.count(RANGE):
+        # Reflectance edges that fit nothing can hide the true basin.
+        basins += find_basins(edges.of_kind(RANGE), start, reach)
     data.progress.step("basins", 1, 1)
     fusion = Fusion(edges, depth, start, reach)
     ranked = rank_basins(fusion, [basin.T_camera_lidar for basin in basins])
     polished = polish_basins(fusion, ranked, config.search, data.progress)
-    selected = choose_basin(fusion, polished, window, config)
-    return settle_basin(fusion, selected, polished.evaluations, data, config)
+    summits = choose_basin(fusion, polished, window)
+    fusion = fusion.balanced_at(summits[0])
+    metrics = basin_metrics(fusion, polished, summits[0], config)
+    objective, search = settle_basin(fusion, summits, polished.evaluations, data, config)
+    return EstimatorResult(objective, search, metrics, fusion.edges)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -295,19 +307,6 @@ class PolishedBasins:
     evaluations: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SelectedBasin:
-    """The basin of the answer.
-
-    Attributes:
-        summits: poses (4, 4) of the polishes that ended in it, highest rank first.
-        metrics: how far it stands out.
-    """
-
-    summits: tuple[Matrix4, ...]
-    metrics: tuple[Metric, ...]
-
-
 def rank_basins(fusion: Fusion, basins: Sequence[Matrix4]) -> RankedBasins:
     """The basins (4, 4) by both cues, and whether the neighbourhood of the start compares with them. It is polished
     wherever the charts rank it."""
@@ -339,8 +338,9 @@ def polish_basins(fusion: Fusion, ranked: RankedBasins, config: SearchConfig, pr
     return PolishedBasins(tuple(with_ranks), ranked.implausible, sum(end.evaluations for end in ends))
 
 
-def choose_basin(fusion: Fusion, polished: PolishedBasins, window: Window, config: CalibrationConfig) -> SelectedBasin:
-    """The basin of the most probable end that lies within the reach, or of the most probable one if none does."""
+def choose_basin(fusion: Fusion, polished: PolishedBasins, window: Window) -> tuple[Matrix4, ...]:
+    """Poses (4, 4) of the polishes that ended in the basin of the answer, highest rank first. It is the basin of the
+    most probable end that lies within the reach, or of the most probable one if none does."""
     highest = max(polished.ends, key=lambda end: end.rank)
     independent = independent_samples_at(fusion.edges.sharp, highest.T_camera_lidar).count / len(window.pairs)
 
@@ -352,37 +352,42 @@ def choose_basin(fusion: Fusion, polished: PolishedBasins, window: Window, confi
         return not at_rim(end.T_camera_lidar, fusion.start, fusion.reach), 0.5 * independent * end.rank**2 + prior
 
     pose = max(polished.ends, key=preferred).T_camera_lidar
+    alike = sorted((end for end in polished.ends if not _differ(end.T_camera_lidar, pose)), key=lambda end: -end.rank)
+    return tuple(end.T_camera_lidar for end in alike)
+
+
+def basin_metrics(
+    fusion: Fusion, polished: PolishedBasins, pose: Matrix4, config: CalibrationConfig
+) -> tuple[Metric, ...]:
+    """How far the basin of a pose (4, 4) stands out from the others."""
     contrast = fusion.edge_contrast(pose)
     others = (*polished.implausible, *(end.T_camera_lidar for end in polished.ends))
     rival = _best_rival(fusion, [other for other in others if _differ(other, pose)], pose)
     limits = config.verdict
-    metrics = (
-        Metric("range_edges", len(fusion.edges.sharp.weight), least_range_edges(config), at_least=True),
+    return (
+        Metric("range_edges", fusion.edges.effective_count, least_range_edges(config), at_least=True),
         Metric("edge_contrast", contrast, limits.min_edge_contrast, at_least=True),
         Metric("runner_up", runner_up(contrast, rival), limits.max_runner_up, at_least=False),
     )
-    alike = sorted((end for end in polished.ends if not _differ(end.T_camera_lidar, pose)), key=lambda end: -end.rank)
-    return SelectedBasin(tuple(end.T_camera_lidar for end in alike), metrics)
 
 
 def settle_basin(
-    fusion: Fusion, selected: SelectedBasin, evaluations: int, data: WindowData, config: CalibrationConfig
-) -> EstimatorResult:
-    """The highest summit of the chosen basin on the sharpest edges. `evaluations` were made before and are included in
-    the result."""
-    highest = selected.summits[0]
+    fusion: Fusion, summits: Sequence[Matrix4], evaluations: int, data: WindowData, config: CalibrationConfig
+) -> tuple[FusedObjective, SearchResult]:
+    """The objective on the sharpest edges, and its highest summit in the basin of some poses (4, 4). `evaluations` were
+    made before and are included in the result."""
+    highest = summits[0]
     leading, finest = fusion.settling
     if fusion.depth_contrast(highest) >= TELLING:
         finest = finest.with_depth(_denser(data, fusion.depth, highest, config))
     settled = [
-        polish_in_turn((leading, finest), summit, config.search, data.progress)
-        for summit in selected.summits[:SETTLED_POSES]
+        polish_in_turn((leading, finest), summit, config.search, data.progress) for summit in summits[:SETTLED_POSES]
     ]
     best = max(settled, key=lambda end: finest.evaluate(end.T_camera_lidar).score)
     search = replace(best, evaluations=evaluations + sum(end.evaluations for end in settled))
     if at_rim(best.T_camera_lidar, fusion.start, fusion.reach):
         search = replace(search, stop_reason=StopReason.AT_BOUND)
-    return EstimatorResult(finest, search, selected.metrics, fusion.edges)
+    return finest, search
 
 
 def _with_ranks(fusion: Fusion, poses: Sequence[Matrix4]) -> list[RankedPose]:

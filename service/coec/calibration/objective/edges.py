@@ -1,9 +1,16 @@
-"""The second witness: range edges of the sweeps laid on edges of the images, at several scales; and how many
-independent frames those of a window are worth."""
+"""The second witness: edges of the sweeps, of range and of reflectance, laid on edges of the images, at several scales;
+and how many independent frames those of a window are worth.
+
+Both kinds of edges add to one significance. Their weights follow from what they are worth in this window: before a pose
+is known, reflectance edges have at most as much weight in all as range edges; at a pose, each kind has the weight that
+makes the significance highest there (`EdgeCue.balanced_at`). So edges that fit nothing count for nothing.
+"""
+
+from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import radians
 from typing import TypeVar
 
@@ -14,11 +21,25 @@ from coec.calibration.objective.mutual_information import Evaluation, SearchBox
 from coec.calibration.types import FramePair, Matrix4, Rig
 from coec.errors import CalibrationError
 from coec.geometry.cameras import Camera, pixel_rad, scaled
-from coec.geometry.edges.alignment import Alignment, EdgeFrames, alignments, frame_alignment, strengths_on_each_map
+from coec.geometry.edges.alignment import (
+    LEAST_SQUARE,
+    Alignment,
+    EdgeFrames,
+    alignment_of_parts,
+    alignments,
+    frame_alignment,
+    strengths_on_each_map,
+)
 from coec.geometry.edges.charts import EdgeCharts, edge_charts
 from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, STRENGTH_STEPS, EdgeScales
 from coec.geometry.edges.range_edges import range_edges
-from coec.geometry.edges.scan_lines import scan_lines
+from coec.geometry.edges.reflectance_edges import (
+    ReflectanceSteps,
+    learn_noise,
+    reflectance_edges,
+    reflectance_steps,
+)
+from coec.geometry.edges.scan_lines import SweepEdges, scan_lines
 from coec.geometry.points import thinned
 from coec.geometry.projection import half_field_of_view_rad, within_cone
 from coec.geometry.sweep_kernels import bearings
@@ -50,10 +71,15 @@ rim, fall on the same image edge or miss it together, and so are one piece of ev
 1/√n of its weight. See docs/measured.md."""
 
 THINNED_POINTS = 3_000
-"""Range edges of the window that score the cover; significance falls only with the square root of their number."""
+"""Edges of the window that score the cover; significance falls only with the square root of their number."""
 
 
 Edges = TypeVar("Edges", EdgeFrames, EdgeCharts)
+
+RANGE, REFLECTANCE = 0, 1
+"""Kinds of edges of a sweep."""
+
+KINDS = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,19 +87,23 @@ class EdgeCue:
     """One witness in four forms: exact and sharp, exact and blurred, bands, and charts.
 
     Attributes:
-        sharp: every range edge on the sharpest image edges, through the lens model: settles a pose.
+        kinds: of the edges of `sharp`, of those of a band, and of those of a thinned chart: uint8 each.
+        balance: (KINDS,) factors of the weights of each kind, the largest one 1.
+        sharp: every edge on the sharpest image edges, through the lens model: settles a pose.
         whole: the same on blurred edges that keep the layout of the scene: leads to `sharp`. It is biased to where
             edges are dense, but its hills are wide; those of an equally fine band are not. It has half as many pixels a
             side, because the blur is a pixel wide.
         blur_rad: the blur of `whole`, an angle about the optical axis.
-        bands: from fine to coarse, `RANKED_POINTS` of the range edges on one band each, through the lens model: rank
+        bands: from fine to coarse, `RANKED_POINTS` of the edges on one band each, through the lens model: rank
             basins.
         band_blur_rad: the blur of each band, an angle likewise.
         half_view_rad: largest angle from the optical axis at which the images have a pixel that counts.
-        charts: the coarsest and the next finer band with the same range edges: fast.
-        thinned: the charts with `THINNED_POINTS` of those range edges: faster.
+        charts: the coarsest and the next finer band with the same edges: fast.
+        thinned: the charts with `THINNED_POINTS` of those edges: faster.
     """
 
+    kinds: tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8]]
+    balance: NDArray[np.float64]
     sharp: EdgeFrames
     whole: EdgeFrames
     blur_rad: float
@@ -87,6 +117,78 @@ class EdgeCue:
     def to_the_sharpest(self) -> tuple[EdgeFrames, ...]:
         """Levels that lead from a few degrees away to the sharpest edges: the bands, from coarse to fine, and those."""
         return (*reversed(self.bands), self.sharp)
+
+    def count(self, kind: int) -> int:
+        """How many edges of a kind the window has."""
+        return int(np.count_nonzero(self.kinds[0] == kind))
+
+    @property
+    def effective_count(self) -> float:
+        """The number of range edges, and of reflectance edges as far as they weigh as much."""
+        share = min(1.0, float(self.balance[REFLECTANCE] / max(self.balance[RANGE], 1e-9)))
+        return self.count(RANGE) + share**2 * self.count(REFLECTANCE)
+
+    def of_kind(self, kind: int) -> EdgeCue:
+        """The cue with the edges of one kind alone."""
+        every, ranked = (np.flatnonzero(kinds == kind) for kinds in self.kinds[:2])
+        subset = thinned(len(ranked), THINNED_POINTS)
+        coarse, fine = (chart.of_points(ranked) for chart in self.charts)
+        return replace(
+            self,
+            kinds=(self.kinds[0][every], self.kinds[1][ranked], self.kinds[1][ranked[subset]]),
+            sharp=self.sharp.of_points(every),
+            whole=self.whole.of_points(every),
+            bands=tuple(band.of_points(ranked) for band in self.bands),
+            charts=(coarse, fine),
+            thinned=(coarse.of_points(subset), fine.of_points(subset)),
+        )
+
+    def significances(self, level: EdgeFrames, T_camera_lidar: Matrix4) -> NDArray[np.float64]:
+        """(KINDS,) z of the edges of each kind alone on `sharp`, `whole` or a band, at a pose (4, 4)."""
+        strength, square = self._sums(level, T_camera_lidar)
+        return np.asarray(strength / np.sqrt(square))
+
+    def balanced_at(self, T_camera_lidar: Matrix4) -> EdgeCue:
+        """The cue with the weights that make it most significant at a pose (4, 4): in proportion to the mean strength
+        of the image's edges under each kind, none where it is below the average (linear discriminant of independent
+        samples of equal variance). Measured on the finest band, whose hills are wider than a pose is uncertain."""
+        if not self.count(REFLECTANCE):
+            return self
+        strength, square = self._sums(self.bands[0], T_camera_lidar)
+        gain = np.maximum(strength / square, 0.0)
+        return self._weighted(gain / gain.max()) if gain.any() else self
+
+    def balanced_by_power(self) -> EdgeCue:
+        """The cue with the weights of the reflectance edges reduced until their squares add to no more than those of
+        the range edges: if they fit nothing at all, the significance of the true pose falls by a root of two."""
+        square = [float((self.sharp.weight[self.kinds[0] == kind] ** 2).sum(dtype=np.float64)) for kind in range(KINDS)]
+        if square[RANGE] == 0.0 or square[REFLECTANCE] <= square[RANGE]:
+            return self
+        return self._weighted(np.array([1.0, math.sqrt(square[RANGE] / square[REFLECTANCE])]))
+
+    def _sums(self, level: EdgeFrames, T_camera_lidar: Matrix4) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        kinds = self.kinds[0] if len(self.kinds[0]) == len(level.weight) else self.kinds[1]
+        sums = alignment_of_parts(level, kinds, KINDS, T_camera_lidar[None])
+        return sums.strength[0].sum(axis=0), np.maximum(sums.square[0].sum(axis=0), LEAST_SQUARE)
+
+    def _weighted(self, factors: NDArray[np.float64]) -> EdgeCue:
+        """The cue with the weight of each edge multiplied by the factor of its kind."""
+        every, ranked, few = (factors.astype(np.float32)[kinds] for kinds in self.kinds)
+        balance = self.balance * factors
+        return replace(
+            self,
+            balance=balance / balance.max(),
+            sharp=replace(self.sharp, weight=self.sharp.weight * every),
+            whole=replace(self.whole, weight=self.whole.weight * every),
+            bands=tuple(replace(band, weight=band.weight * ranked) for band in self.bands),
+            charts=_reweighted(self.charts, ranked),
+            thinned=_reweighted(self.thinned, few),
+        )
+
+
+def _reweighted(charts: tuple[EdgeCharts, EdgeCharts], factors: NDArray[np.float32]) -> tuple[EdgeCharts, EdgeCharts]:
+    coarse, fine = (replace(chart, weight=np.rint(chart.weight * factors).astype(np.int32)) for chart in charts)
+    return coarse, fine
 
 
 ROUNDING_RAD = radians(0.1)
@@ -132,7 +234,8 @@ Points = Callable[[int, NDArray[np.int64]], NDArray[np.float32]]
 
 
 def build_edges(pairs: Sequence[FramePair], points: Points, greys: Iterable[NDArray[np.uint8]], rig: Rig) -> EdgeCue:
-    """Range edges of the sweeps (found as measured, placed motion-compensated) and edge maps of the images.
+    """Edges of the sweeps (found as measured, placed motion-compensated) and edge maps of the images. Sweeps without
+    reflectance have range edges only.
 
     Args:
         pairs: those of the window.
@@ -140,22 +243,17 @@ def build_edges(pairs: Sequence[FramePair], points: Points, greys: Iterable[NDAr
         greys: (height, width) uint8, the images of the pairs.
 
     Raises:
-        CalibrationError: no sweep has a range edge, or an image is not of the camera's size.
+        CalibrationError: no sweep has an edge, or an image is not of the camera's size.
     """
-    detected = [range_edges(scan_lines(pair.lidar.xyz_m, pair.lidar.ring)) for pair in pairs]
-    first_point = np.concatenate([[0], np.cumsum([len(edges.index) for edges in detected])]).astype(np.int64)
+    detected = _detected(pairs)
+    first_point = np.concatenate([[0], np.cumsum([len(edges.weight) for edges in detected])]).astype(np.int64)
     if first_point[-1] == 0:
         raise CalibrationError(
             "no depth discontinuity in any sweep: the edge objective has nothing to align with the images' edges"
         )
     # The shift is not compensated: motion compensation turns this tenth of a degree by two degrees at most.
     xyz_m = np.concatenate([points(frame, edges.index) + edges.shift_m for frame, edges in enumerate(detected)])
-    weight = np.concatenate(
-        [
-            edges.weight / np.sqrt(_neighbours(pair.lidar.xyz_m[edges.index]))
-            for edges, pair in zip(detected, pairs, strict=True)
-        ]
-    ).astype(np.float32)
+    weight, kind = (np.concatenate([getattr(edges, of) for edges in detected]) for of in ("weight", "kind"))
     finest, coarsest = _finest_level(rig.camera), _coarsest_level(rig.camera)
     finest = min(finest, coarsest + 1 - BANDS)
     sharp, whole, *of_bands = _maps(rig, finest, coarsest, greys, len(pairs))
@@ -178,7 +276,9 @@ def build_edges(pairs: Sequence[FramePair], points: Points, greys: Iterable[NDAr
         for k in (-1, -2)
     )
     subset = thinned(len(ranked), THINNED_POINTS)
-    return EdgeCue(
+    cue = EdgeCue(
+        kinds=(kind, kind[ranked], kind[ranked[subset]]),
+        balance=np.ones(KINDS),
         sharp=frames(finest, sharp, every),
         whole=frames(finest + 1, whole, every),
         blur_rad=_blur_rad(rig.camera, finest),
@@ -188,6 +288,43 @@ def build_edges(pairs: Sequence[FramePair], points: Points, greys: Iterable[NDAr
         charts=(coarse, fine),
         thinned=(coarse.of_points(subset), fine.of_points(subset)),
     )
+    return cue.balanced_by_power()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Detected:
+    """Edges of a sweep, those of range before those of reflectance: as in `SweepEdges`, and the kind of each, uint8."""
+
+    index: NDArray[np.int64]
+    shift_m: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    kind: NDArray[np.uint8]
+
+
+def _detected(pairs: Sequence[FramePair]) -> list[_Detected]:
+    """The edges of each sweep; those in one cell share their weight."""
+    of_range: list[SweepEdges] = []
+    steps: list[ReflectanceSteps | None] = []
+    for pair in pairs:
+        lines = scan_lines(pair.lidar.xyz_m, pair.lidar.ring)
+        of_range.append(range_edges(lines))
+        reflectance = pair.lidar.intensity
+        steps.append(None if reflectance is None else reflectance_steps(lines, reflectance))
+    noise = learn_noise([one for one in steps if one is not None])
+    detected = []
+    for pair, edges, step in zip(pairs, of_range, steps, strict=True):
+        kinds = [edges] if step is None or noise is None else [edges, reflectance_edges(step, noise)]
+        detected.append(
+            _Detected(
+                np.concatenate([one.index for one in kinds]),
+                np.concatenate([one.shift_m for one in kinds]),
+                np.concatenate(
+                    [one.weight / np.sqrt(_neighbours(pair.lidar.xyz_m[one.index])) for one in kinds]
+                ).astype(np.float32),
+                np.repeat(np.arange(len(kinds), dtype=np.uint8), [len(one.index) for one in kinds]),
+            )
+        )
+    return detected
 
 
 def _neighbours(xyz_m: NDArray[np.float32]) -> NDArray[np.int64]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.objective import mutual_information
-from coec.calibration.objective.edges import EdgeCue, in_reach
+from coec.calibration.objective.edges import KINDS, EdgeCue, in_reach
 from coec.calibration.search.global_search import sample_reach
 from coec.calibration.types import Matrix4
 from coec.geometry.cameras import in_image
@@ -168,28 +168,35 @@ class Fusion:
         seen = mutual_information.SearchBox(
             of_edges.rotation_rad + BEYOND.rotation_rad, of_edges.translation_m + BEYOND.translation_m
         )
-        edges = replace(
-            edges,
-            bands=tuple(in_reach(band, edges.half_view_rad, start, seen) for band in edges.bands),
-            whole=in_reach(edges.whole, edges.half_view_rad, start, seen),
-            sharp=in_reach(edges.sharp, edges.half_view_rad, start, seen),
-        )
-        self._of_bands = Scale.of(np.mean([charted_significances(chart, poses) for chart in edges.charts], axis=0))
+
+        def visible(cue: EdgeCue) -> tuple[alignment.EdgeFrames, ...]:
+            return tuple(in_reach(band, edges.half_view_rad, start, seen) for band in cue.bands)
+
+        self._bands, self._of_bands = visible(edges), _scale_of_bands(edges, poses)
+        alone = [edges.of_kind(kind) for kind in range(KINDS) if 0 < edges.count(kind) < len(edges.kinds[0])]
+        self._kinds = [(visible(cue), _scale_of_bands(cue, poses)) for cue in alone]
+        self._kinds = self._kinds or [(self._bands, self._of_bands)]
         self.ranking = tuple(
             FusedObjective(band, blur_rad, depth, self._of_bands, self._of_depth)
-            for band, blur_rad in reversed(list(zip(edges.bands[:-1], edges.band_blur_rad[:-1], strict=True)))
+            for band, blur_rad in reversed(list(zip(self._bands[:-1], edges.band_blur_rad[:-1], strict=True)))
         )
-        of_whole, of_sharp = (Scale.of(alignment.significances(level, poses)) for level in (edges.whole, edges.sharp))
+        whole, sharp = (in_reach(level, edges.half_view_rad, start, seen) for level in (edges.whole, edges.sharp))
+        of_whole, of_sharp = (Scale.of(alignment.significances(level, poses)) for level in (whole, sharp))
         self.settling = (
-            FusedObjective(edges.whole, edges.blur_rad, depth, of_whole, self._of_depth),
-            FusedObjective(edges.sharp, edges.blur_rad, depth, of_sharp, self._of_depth),
+            FusedObjective(whole, edges.blur_rad, depth, of_whole, self._of_depth),
+            FusedObjective(sharp, edges.blur_rad, depth, of_sharp, self._of_depth),
         )
+
+    def balanced_at(self, T_camera_lidar: Matrix4) -> Fusion:
+        """The same witnesses, with edges of range and of reflectance weighted by what each is worth at a pose (4, 4);
+        see `EdgeCue.balanced_at`."""
+        edges = self.edges.balanced_at(T_camera_lidar)
+        return self if edges is self.edges else Fusion(edges, self.depth, self.start, self.reach)
 
     def edge_contrasts(self, poses: NDArray[np.float64]) -> list[float]:
         """How far the edge witness, averaged over its bands, stands above other poses at each of K poses (K, 4, 4);
         standard deviations."""
-        of_bands = np.stack([alignment.significances(band, poses) for band in self.edges.bands], axis=1)
-        return [self._of_bands.standard(float(np.mean(z))) for z in of_bands]
+        return _contrasts(self._bands, self._of_bands, poses)
 
     def edge_contrast(self, T_camera_lidar: Matrix4) -> float:
         """The same at one pose (4, 4)."""
@@ -204,17 +211,28 @@ class Fusion:
         return self.depth_contrasts(T_camera_lidar[None])[0]
 
     def ranks(self, poses: Sequence[Matrix4]) -> list[float]:
-        """How far each of some poses (4, 4) stands out to both witnesses, standard deviations.
+        """How far each of some poses (4, 4) stands out to range edges, reflectance edges and depth, standard
+        deviations.
 
         It is the root of the sum of squares, because that is how improbabilities combine (Fisher 1925: the logarithm of
         a normal tail falls with the square). With a plain sum, two weak results could outdo one that cannot be chance.
         """
         stacked = np.array(poses).reshape(-1, 4, 4)
-        return [
-            hypot(max(edges, 0.0), max(depth, 0.0))
-            for edges, depth in zip(self.edge_contrasts(stacked), self.depth_contrasts(stacked), strict=True)
-        ]
+        contrasts = [_contrasts(bands, scale, stacked) for bands, scale in self._kinds]
+        witnesses = zip(*contrasts, self.depth_contrasts(stacked), strict=True)
+        return [hypot(*(max(contrast, 0.0) for contrast in of_pose)) for of_pose in witnesses]
 
     def rank(self, T_camera_lidar: Matrix4) -> float:
         """The same for one pose (4, 4)."""
         return self.ranks([T_camera_lidar])[0]
+
+
+def _scale_of_bands(edges: EdgeCue, poses: NDArray[np.float64]) -> Scale:
+    """The scale of the significance, averaged over the bands, from other poses (K, 4, 4)."""
+    return Scale.of(np.mean([charted_significances(chart, poses) for chart in edges.charts], axis=0))
+
+
+def _contrasts(bands: Sequence[alignment.EdgeFrames], scale: Scale, poses: NDArray[np.float64]) -> list[float]:
+    """How far the significance, averaged over some bands, stands above other poses at each of K poses (K, 4, 4)."""
+    of_bands = np.stack([alignment.significances(band, poses) for band in bands], axis=1)
+    return [scale.standard(float(np.mean(z))) for z in of_bands]

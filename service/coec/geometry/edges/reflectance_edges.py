@@ -1,5 +1,5 @@
-"""Reflectance edges: where the reflectance of a surface jumps along a scan line, though its range does not. Paint, signs,
-plates, boards and joints of walls make such edges, and an image edge with each (METHOD, section 5).
+"""Reflectance edges: where the reflectance of a surface jumps along a scan line, though its range does not. Paint,
+signs, plates, boards and joints of walls make such edges, and an image edge with each (METHOD, section 5).
 
 Five neighbours along a scan line form a step if they lie on one smooth surface: two before, the point, two after. Its
 height is the difference of the means of both sides. It counts as an edge if it is steep against the noise of this LiDAR
@@ -103,7 +103,9 @@ def reflectance_steps(lines: ScanLines, reflectance: NDArray[np.float32]) -> Ref
 
 
 def learn_noise(sweeps: Sequence[ReflectanceSteps]) -> ReflectanceNoise | None:
-    """The noise of a LiDAR, from its sweeps; None if they have too few steps, or all of one value."""
+    """The noise of a LiDAR, from its sweeps; None if there are too few steps, or all of one value."""
+    if not sweeps:
+        return None
     finite = [np.isfinite(steps.height) for steps in sweeps]
     height = np.concatenate([np.abs(steps.height[of]) for steps, of in zip(sweeps, finite, strict=True)])
     level = np.concatenate([steps.level[of] for steps, of in zip(sweeps, finite, strict=True)])
