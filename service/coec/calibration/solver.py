@@ -14,13 +14,7 @@ from numpy.typing import NDArray
 from coec.calibration.frames.ego_mask import MIN_FRAMES, MIN_SPEED_MPS, lit_pixels
 from coec.calibration.frames.motion_compensation import EVERY, Choice, compensate
 from coec.calibration.objective import mutual_information
-from coec.calibration.objective.edges import (
-    RANGE,
-    REFLECTANCE,
-    EdgeCue,
-    build_edges,
-    independent_samples_at,
-)
+from coec.calibration.objective.edges import EdgeCue, build_edges, independent_samples_at
 from coec.calibration.objective.fused import FusedObjective, Fusion
 from coec.calibration.search.global_search import at_rim, basin_next_to, find_basins
 from coec.calibration.search.local_search import SearchResult, box_of, maximise, near, polish_in_turn
@@ -254,10 +248,8 @@ def by_fusion(data: WindowData, config: CalibrationConfig) -> EstimatorResult:
     edges = build_edges(window.pairs, data.points, data.greys(), window.rig)
     features = depth_features(data, start, LEADING_DEPTH_POINTS)
     depth = mutual_information.build_mutual_information(features, window.rig, start, reach, config.objective)
-    basins = find_basins(edges, start, reach)
-    if edges.count(REFLECTANCE) and edges.count(RANGE):
-        # Reflectance edges that fit nothing can hide the true basin.
-        basins += find_basins(edges.of_kind(RANGE), start, reach)
+    # Each kind of edges by itself: those that fit nothing hide no basin of the others.
+    basins = [basin for cue in edges.kinds_alone for basin in find_basins(cue, start, reach)]
     data.progress.step("basins", 1, 1)
     fusion = Fusion(edges, depth, start, reach)
     ranked = rank_basins(fusion, [basin.T_camera_lidar for basin in basins])

@@ -1,9 +1,11 @@
 """The edge witness of a window: its levels, whatever the camera, and its points."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.objective.edges import (
@@ -12,7 +14,9 @@ from coec.calibration.objective.edges import (
     COARSEST_BLUR_RAD,
     MAX_PIXELS,
     MOST_STRENGTH,
+    RANGE,
     RANKED_POINTS,
+    REFLECTANCE,
     THINNED_POINTS,
     EdgeCue,
     EdgesAlone,
@@ -23,7 +27,7 @@ from coec.config import LimitsConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3
 from coec.geometry.cameras import Camera, build
-from coec.geometry.edges.alignment import EdgeFrames, significances
+from coec.geometry.edges.alignment import EdgeFrames, frame_alignment, significances
 from coec.geometry.edges.charts import CELLS_PER_BLUR, MAX_CHART_POINTS
 from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, STRENGTH_STEPS, VOID, EdgeScales
 from coec.geometry.edges.range_edges import range_edges
@@ -32,6 +36,8 @@ from coec.geometry.projection import project, unproject
 from coec.io.images import GreyImages
 
 GREY = GreyImages(LimitsConfig())
+
+Points = NDArray[np.float32]
 
 
 def with_camera(window: Window, camera: Camera) -> EdgeCue:
@@ -98,13 +104,14 @@ def test_maps_are_those_of_the_images_with_strong_edges_cut_off(sharp_street: Wi
 
 
 def test_points_are_the_range_edges_where_they_were_at_the_exposure(sharp_street: Window, sharp_edges: EdgeCue) -> None:
-    first = sharp_edges.sharp.first_point
+    edges = sharp_edges.kinds_alone[RANGE].sharp
+    first = edges.first_point
     for f, pair in enumerate(sharp_street.pairs):
         result = range_edges(scan_lines(pair.lidar.xyz_m, pair.lidar.ring))
         cloud = compensate(pair, sharp_street.rig, enabled=True)
         at_m = cloud[result.index] + result.shift_m
-        np.testing.assert_array_equal(sharp_edges.sharp.xyz_m[:, first[f] : first[f + 1]].T, at_m)
-        weight = sharp_edges.sharp.weight[first[f] : first[f + 1]]
+        np.testing.assert_array_equal(edges.xyz_m[:, first[f] : first[f + 1]].T, at_m)
+        weight = edges.weight[first[f] : first[f + 1]]
         assert (weight <= result.weight).all()
         # What has no neighbour within a cell's diagonal keeps its weight.
         near = pair.lidar.xyz_m[result.index]
@@ -112,6 +119,68 @@ def test_points_are_the_range_edges_where_they_were_at_the_exposure(sharp_street
         alone = (rays @ rays.T > np.cos(2.0 * CELL_RAD)).sum(axis=1) == 1
         np.testing.assert_array_equal(weight[alone], result.weight[alone])
         assert (weight[~alone] < result.weight[~alone]).any()
+
+
+def with_reflectance(window: Window, values: Callable[[int, Points], NDArray[np.float32] | None]) -> EdgeCue:
+    """The edges of a window whose sweeps have other reflectances: by their index and points (N, 3)."""
+    pairs = [
+        replace(pair, lidar=replace(pair.lidar, intensity=values(index, pair.lidar.xyz_m)))
+        for index, pair in enumerate(window.pairs)
+    ]
+    greys = (GREY.grey(pair.camera) for pair in pairs)
+    return build_edges(
+        pairs, lambda f, selected: compensate(pairs[f], window.rig, enabled=True, selection=selected), greys, window.rig
+    )
+
+
+def test_each_kind_of_edges_weighs_what_it_is_worth_at_a_pose(sharp_street: Window, sharp_edges: EdgeCue) -> None:
+    truth = sharp_street.T_camera_lidar_start
+    balanced = sharp_edges.balanced_at(truth)
+    band = balanced.bands[0]
+    whole = frame_alignment(band, truth).significance
+    by_kind = balanced.significances(band, truth)
+    assert sharp_edges.count(REFLECTANCE) > 100
+    assert min(by_kind) > 5.0
+    # With the best weights the squares of both add, and any other weights give less.
+    assert whole == pytest.approx(np.linalg.norm(by_kind), rel=1e-3)
+    for factors in ([1.0, 0.5], [0.5, 1.0], [1.0, 0.0]):
+        weight = np.float32(factors)[balanced.kinds[1]] * band.weight
+        assert frame_alignment(replace(band, weight=weight), truth).significance < whole
+    assert balanced.effective_count > balanced.count(RANGE)
+
+
+def test_reflectance_of_other_places_weighs_nothing_and_none_changes_nothing(sharp_street: Window) -> None:
+    truth, rng = sharp_street.T_camera_lidar_start, np.random.default_rng(0)
+    known = [pair.lidar.intensity for pair in sharp_street.pairs]
+    shuffled = with_reflectance(
+        sharp_street, lambda f, xyz_m: np.roll(np.resize(known[f - 1], len(xyz_m)), int(rng.integers(100, 10_000)))
+    )
+    assert shuffled.count(REFLECTANCE) > 100
+    balance = shuffled.balanced_at(truth).balance
+    assert balance[RANGE] == 1.0
+    assert balance[REFLECTANCE] < 0.2
+    without = with_reflectance(sharp_street, lambda *_: None)
+    constant = with_reflectance(sharp_street, lambda _, xyz_m: np.full(len(xyz_m), 3.0, np.float32))
+    for cue in (without, constant):
+        assert cue.count(REFLECTANCE) == 0
+        assert cue.balanced_at(truth) is cue
+        np.testing.assert_array_equal(cue.sharp.weight, without.sharp.weight)
+        assert [len(alone.sharp.weight) for alone in cue.kinds_alone] == [len(without.sharp.weight)]
+
+
+def test_before_a_pose_is_known_reflectance_weighs_no_more_than_range(sharp_street: Window) -> None:
+    """Stripes on everything: several times as many edges as there are silhouettes."""
+
+    def striped(_: int, xyz_m: Points) -> NDArray[np.float32]:
+        stripes = np.degrees(np.arctan2(xyz_m[:, 1], xyz_m[:, 0])) % 4.0 < 2.0
+        return (100.0 * stripes + np.arange(len(stripes)) % 3).astype(np.float32)
+
+    cue = with_reflectance(sharp_street, striped)
+    assert cue.count(REFLECTANCE) > 2 * cue.count(RANGE)
+    square = [
+        np.square(cue.sharp.weight[cue.kinds[0] == kind], dtype=np.float64).sum() for kind in (RANGE, REFLECTANCE)
+    ]
+    assert square[REFLECTANCE] == pytest.approx(square[RANGE], rel=1e-4)
 
 
 def test_charts_are_of_the_coarse_bands_with_all_of_their_points_or_some(sharp_edges: EdgeCue) -> None:

@@ -188,7 +188,8 @@ def test_the_truth_stands_out_and_other_poses_are_spread_around_nought(sharp_str
     assert abs(np.mean(edges)) < 0.2
     assert 0.7 < np.std(edges) < 1.3
     assert fusion.edge_contrast(truth) > max(edges)
-    assert fusion.rank(truth) == pytest.approx(np.hypot(fusion.edge_contrast(truth), fusion.depth_contrast(truth)))
+    by_kind = np.ravel(fusion.contrasts_by_kind(truth[None]))
+    assert fusion.rank(truth) == pytest.approx(np.linalg.norm([*by_kind, fusion.depth_contrast(truth)]))
     assert fusion.rank(truth) > max(fusion.rank(pose) for pose in others)
 
 
@@ -317,12 +318,12 @@ def test_an_image_that_cannot_be_decoded_is_an_error_that_names_its_frame(
         solve(broken, stereo)
 
 
-def test_sweeps_without_a_jump_in_range_are_an_error(sharp_street: Window, stereo: DepthModel) -> None:
+def test_sweeps_without_a_jump_of_range_or_reflectance_are_an_error(sharp_street: Window, stereo: DepthModel) -> None:
     def on_a_sphere(pair: FramePair) -> FramePair:
         xyz_m = pair.lidar.xyz_m / np.linalg.norm(pair.lidar.xyz_m, axis=1, keepdims=True) * np.float32(10.0)
-        return replace(pair, lidar=replace(pair.lidar, xyz_m=xyz_m.astype(np.float32)))
+        return replace(pair, lidar=replace(pair.lidar, xyz_m=xyz_m.astype(np.float32), intensity=None))
 
-    with pytest.raises(CalibrationError, match="no depth discontinuity in any sweep"):
+    with pytest.raises(CalibrationError, match="no edge of range or reflectance in any sweep"):
         solve(replace(sharp_street, pairs=tuple(on_a_sphere(pair) for pair in sharp_street.pairs)), stereo)
 
 
@@ -350,7 +351,7 @@ def test_what_cannot_be_chance_to_one_cue_outranks_two_poor_showings(
     """In a garage with a network that has never seen one, a plain sum preferred 3.2 + 2.4 to 6.6 - 1.1."""
 
     def ranked(edges: float, depth: float) -> float:
-        monkeypatch.setattr(Fusion, "edge_contrasts", lambda *_: [edges])
+        monkeypatch.setattr(Fusion, "contrasts_by_kind", lambda *_: [[edges]])
         monkeypatch.setattr(Fusion, "depth_contrasts", lambda *_: [depth])
         return fusion.rank(np.eye(4))
 

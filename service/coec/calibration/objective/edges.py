@@ -128,8 +128,13 @@ class EdgeCue:
         share = min(1.0, float(self.balance[REFLECTANCE] / max(self.balance[RANGE], 1e-9)))
         return self.count(RANGE) + share**2 * self.count(REFLECTANCE)
 
-    def of_kind(self, kind: int) -> EdgeCue:
-        """The cue with the edges of one kind alone."""
+    @property
+    def kinds_alone(self) -> list[EdgeCue]:
+        """One cue for each kind of edges that the window has."""
+        present = [kind for kind in range(KINDS) if self.count(kind)]
+        return [self] if len(present) == 1 else [self._of_kind(kind) for kind in present]
+
+    def _of_kind(self, kind: int) -> EdgeCue:
         every, ranked = (np.flatnonzero(kinds == kind) for kinds in self.kinds[:2])
         subset = thinned(len(ranked), THINNED_POINTS)
         coarse, fine = (chart.of_points(ranked) for chart in self.charts)
@@ -249,7 +254,8 @@ def build_edges(pairs: Sequence[FramePair], points: Points, greys: Iterable[NDAr
     first_point = np.concatenate([[0], np.cumsum([len(edges.weight) for edges in detected])]).astype(np.int64)
     if first_point[-1] == 0:
         raise CalibrationError(
-            "no depth discontinuity in any sweep: the edge objective has nothing to align with the images' edges"
+            "no edge of range or reflectance in any sweep: the edge objective has nothing to align with the edges of "
+            "the images"
         )
     # The shift is not compensated: motion compensation turns this tenth of a degree by two degrees at most.
     xyz_m = np.concatenate([points(frame, edges.index) + edges.shift_m for frame, edges in enumerate(detected)])

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.objective import mutual_information
-from coec.calibration.objective.edges import KINDS, EdgeCue, in_reach
+from coec.calibration.objective.edges import EdgeCue, in_reach
 from coec.calibration.search.global_search import sample_reach
 from coec.calibration.types import Matrix4
 from coec.geometry.cameras import in_image
@@ -173,9 +173,7 @@ class Fusion:
             return tuple(in_reach(band, edges.half_view_rad, start, seen) for band in cue.bands)
 
         self._bands, self._of_bands = visible(edges), _scale_of_bands(edges, poses)
-        alone = [edges.of_kind(kind) for kind in range(KINDS) if 0 < edges.count(kind) < len(edges.kinds[0])]
-        self._kinds = [(visible(cue), _scale_of_bands(cue, poses)) for cue in alone]
-        self._kinds = self._kinds or [(self._bands, self._of_bands)]
+        self._kinds = [(visible(cue), _scale_of_bands(cue, poses)) for cue in edges.kinds_alone]
         self.ranking = tuple(
             FusedObjective(band, blur_rad, depth, self._of_bands, self._of_depth)
             for band, blur_rad in reversed(list(zip(self._bands[:-1], edges.band_blur_rad[:-1], strict=True)))
@@ -202,6 +200,10 @@ class Fusion:
         """The same at one pose (4, 4)."""
         return self.edge_contrasts(T_camera_lidar[None])[0]
 
+    def contrasts_by_kind(self, poses: NDArray[np.float64]) -> list[list[float]]:
+        """The same for each kind of edges by itself."""
+        return [_contrasts(bands, scale, poses) for bands, scale in self._kinds]
+
     def depth_contrasts(self, poses: NDArray[np.float64]) -> list[float]:
         """How far the depth witness stands above other poses at each of K poses (K, 4, 4); standard deviations."""
         return [self._of_depth.standard(at.score) for at in self.depth.evaluate_each(poses)]
@@ -218,8 +220,7 @@ class Fusion:
         a normal tail falls with the square). With a plain sum, two weak results could outdo one that cannot be chance.
         """
         stacked = np.array(poses).reshape(-1, 4, 4)
-        contrasts = [_contrasts(bands, scale, stacked) for bands, scale in self._kinds]
-        witnesses = zip(*contrasts, self.depth_contrasts(stacked), strict=True)
+        witnesses = zip(*self.contrasts_by_kind(stacked), self.depth_contrasts(stacked), strict=True)
         return [hypot(*(max(contrast, 0.0) for contrast in of_pose)) for of_pose in witnesses]
 
     def rank(self, T_camera_lidar: Matrix4) -> float:

@@ -7,8 +7,9 @@ at this level, if both sides are plateaus, and if no step next to it is higher. 
 follows from the value of the point in the middle, which the beam gathers from both sides.
 
 Every LiDAR has its own scale, quantisation and noise: calibrated values of 8 bits, or raw ones whose scatter grows with
-their level. So the noise is learned from the sweeps: the median height of all steps at a level, nearly all of which lie
-on surfaces without an edge.
+their level. So the noise is learned from the sweeps: the median height of all steps at a level, most of which lie on
+surfaces without an edge. An edge is compared with the noise at the levels of its two sides; between them there may be
+edges only.
 """
 
 import math
@@ -80,14 +81,15 @@ class ReflectanceNoise:
     level: NDArray[np.float64]
     sigma: NDArray[np.float64]
 
-    def at(self, level: NDArray[np.float32]) -> NDArray[np.float64]:
+    def at(self, level: NDArray[np.float64]) -> NDArray[np.float64]:
         """(M,) at other levels (M,)."""
         return np.asarray(np.interp(level, self.level, self.sigma))
 
 
 def reflectance_steps(lines: ScanLines, reflectance: NDArray[np.float32]) -> ReflectanceSteps:
-    """The steps of reflectance along the scan lines of a sweep; `reflectance` (N,) is in any unit."""
-    values = np.ascontiguousarray(reflectance, np.float32)
+    """The steps of reflectance along the scan lines of a sweep; `reflectance` (N,) is in any unit, and anything that is
+    not finite is unknown."""
+    values = np.where(np.isfinite(reflectance), reflectance, np.nan).astype(np.float32)
     height, level, turn_rad, highest = _steps(
         lines.first,
         lines.azimuth,
@@ -124,8 +126,10 @@ def learn_noise(sweeps: Sequence[ReflectanceSteps]) -> ReflectanceNoise | None:
 
 def reflectance_edges(steps: ReflectanceSteps, noise: ReflectanceNoise) -> SweepEdges:
     """The edges among the steps of a sweep; all have weight 1."""
-    steep = np.abs(steps.height) > LEAST_STEP * noise.at(steps.level)
-    at = np.flatnonzero(steps.highest & steep)
+    at = np.flatnonzero(steps.highest)
+    height, level = steps.height[at].astype(np.float64), steps.level[at].astype(np.float64)
+    sides = [noise.at(level + share * height) for share in (-0.5, 0.5)]
+    at = at[np.abs(height) > LEAST_STEP * np.sqrt(0.5 * (sides[0] ** 2 + sides[1] ** 2))]
     index = steps.lines.order[at].astype(np.int64)
     shift_m = turned_about_the_axis(steps.lines.xyz_m[index], steps.turn_rad[at])
     return SweepEdges(index, shift_m, np.ones(len(index), np.float32))

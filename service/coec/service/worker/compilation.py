@@ -135,6 +135,7 @@ COMMON: Mapping[str, tuple[str, ...]] = {
         "halved",
     ),
     "edges.range_edges": ("_jumps",),
+    "edges.reflectance_edges": ("_steps",),
     "edges.scan_lines": ("_along_the_rows",),
     "images": ("level_counts", "neighbour_differences", "square_sums"),
     "mutual_information": ("_count_reached", "_information", "_informations", "_tasks"),

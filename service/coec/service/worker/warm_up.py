@@ -162,6 +162,7 @@ def invented_window(rig: Rig) -> Window:
     direction = rng.normal(size=(POINTS, 3))
     range_m = rng.uniform(5.0, 30.0, size=(POINTS, 1))
     xyz_m = (range_m * direction / np.linalg.norm(direction, axis=1, keepdims=True)).astype(np.float32)
+    reflectance = rng.random(POINTS, dtype=np.float32)
     xyz_m.setflags(write=False)
     width, height = rig.camera.width, rig.camera.height
     jpeg = encode_jpeg(rng.integers(0, 256, (height, width), np.uint8))
@@ -169,7 +170,7 @@ def invented_window(rig: Rig) -> Window:
     pairs = tuple(
         FramePair(
             CameraFrame(stamp, rig.camera_frame, image),
-            LidarFrame(stamp, rig.lidar_frame, xyz_m),
+            LidarFrame(stamp, rig.lidar_frame, xyz_m, intensity=reflectance),
             EgoMotion(stamp, "ego", (1.0, 0.0, 0.0), (0.0, 0.0, 0.1)),
         )
         for stamp in range(0, MIN_PAIRS * 100_000_000, 100_000_000)
