@@ -164,6 +164,6 @@ def _slow(
             plateau[k] = height[k] != 0 and max(abs(b - a), abs(d - c)) <= PLATEAU_SHARE * abs(height[k])
     highest = plateau.copy()
     size = np.nan_to_num(np.abs(height))
-    for k in np.flatnonzero(plateau):
+    for k in np.flatnonzero(plateau).tolist():
         highest[k] = (size[k - 2 : k] < size[k]).all() and (size[k + 1 : k + 3] <= size[k]).all()
     return height, highest

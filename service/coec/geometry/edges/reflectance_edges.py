@@ -184,17 +184,12 @@ def _steps(
         for k in range(begin, end):
             if highest[k]:
                 b, c = previous[k], following[k]
-                # Of equally high neighbours the first one counts.
+                # Of equally high neighbours the first one counts. A comparison with NaN is false.
+                most = abs(height[k])
                 highest[k] = not (
-                    _higher(height[previous[b]], height[k], True)
-                    or _higher(height[b], height[k], True)
-                    or _higher(height[c], height[k], False)
-                    or _higher(height[following[c]], height[k], False)
+                    abs(height[previous[b]]) >= most
+                    or abs(height[b]) >= most
+                    or abs(height[c]) > most
+                    or abs(height[following[c]]) > most
                 )
     return height, level, turn_rad, highest
-
-
-@njit(cache=True, inline="always")
-def _higher(one: np.float32, other: np.float32, or_equal: bool) -> bool:
-    """Whether one step is higher than another, whatever their signs; a NaN is not."""
-    return abs(one) > abs(other) or (or_equal and abs(one) == abs(other))
