@@ -82,4 +82,5 @@ def calibrate(
         ),
         moved=moved,
         lens=estimate_lens(optimum.posterior, window.rig.camera),
+        cues=result.cues,
     )

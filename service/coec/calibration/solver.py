@@ -20,6 +20,7 @@ from coec.calibration.search.global_search import at_rim, basin_next_to, find_ba
 from coec.calibration.search.local_search import SearchResult, box_of, maximise, near, polish_in_turn
 from coec.calibration.types import (
     CameraFrame,
+    CueShare,
     DepthMap,
     DepthModel,
     ImageReader,
@@ -204,12 +205,14 @@ class EstimatorResult:
         search: the end of the search on it.
         metrics: those that only this objective has.
         edges: the edges of the window; None if it used none.
+        cues: what each cue contributed; empty if there is one only.
     """
 
     objective: mutual_information.Divisible
     search: SearchResult
     metrics: tuple[Metric, ...]
     edges: EdgeCue | None = None
+    cues: tuple[CueShare, ...] = ()
 
 
 Estimator = Callable[[WindowData, CalibrationConfig], EstimatorResult]
@@ -258,7 +261,8 @@ def by_fusion(data: WindowData, config: CalibrationConfig) -> EstimatorResult:
     fusion = fusion.balanced_at(summits[0])
     metrics = basin_metrics(fusion, polished, summits[0], config)
     objective, search = settle_basin(fusion, summits, polished.evaluations, data, config)
-    return EstimatorResult(objective, search, metrics, fusion.edges)
+    cues = objective.cue_shares(fusion.edges, search.T_camera_lidar, config.search.dof)
+    return EstimatorResult(objective, search, metrics, fusion.edges, cues)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

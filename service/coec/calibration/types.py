@@ -509,6 +509,25 @@ class LensEstimate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class CueShare:
+    """What one cue contributed to a result.
+
+    Attributes:
+        name: `range_edges`, `reflectance_edges` or `depth`.
+        samples: edges of the window, or points in view.
+        weight: of its samples, relative to those of the other kind of edges: 0 to 1; 1 for depth.
+        significance: of this cue alone at the result, standard deviations; of depth, above other poses.
+        share: (6,) of the curvature of the objective along each axis of ξ, 0 to 1; NaN on axes that were not searched.
+    """
+
+    name: str
+    samples: int
+    weight: float
+    significance: float
+    share: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """The immutable result of calibrating one window.
 
@@ -523,6 +542,7 @@ class Estimate:
         config_hash: of everything that decides the result.
         moved: the move for which the window was refused; None if the camera did not move within it.
         lens: what the window says of the lens; None if its objective uses no edges, or they determine no pose.
+        cues: what each cue contributed; empty if the objective has one cue only.
     """
 
     window_id: str
@@ -539,6 +559,7 @@ class Estimate:
     config_hash: str
     moved: MovedWithin | None = None
     lens: LensEstimate | None = None
+    cues: tuple[CueShare, ...] = ()
 
     @property
     def sigma(self) -> NDArray[np.float64]:

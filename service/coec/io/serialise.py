@@ -15,6 +15,7 @@ from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.state import PairState
 from coec.calibration.state_machine import step_between
 from coec.calibration.types import (
+    CueShare,
     Decision,
     Estimate,
     LensEstimate,
@@ -151,6 +152,13 @@ def result_of(estimate: Estimate, rig: Rig, vehicle: str) -> replies.Calibration
         moved=None if estimate.moved is None else _moved_of(estimate.moved),
         intrinsics=intrinsics_of(rig.camera),
         lens=None if estimate.lens is None else lens_of(estimate.lens, rig.camera),
+        cues={cue.name: _cue_of(cue) for cue in estimate.cues} or None,
+    )
+
+
+def _cue_of(cue: CueShare) -> replies.Cue:
+    return replies.Cue(
+        samples=cue.samples, weight=cue.weight, significance=number_or_null(cue.significance), share=_maybe6(cue.share)
     )
 
 
@@ -166,13 +174,14 @@ def mistake_of(mistake: Mistake) -> replies.ProbableMistake:
 
 def comparable(reached: replies.CalibrationResult, recorded: replies.CalibrationResult) -> replies.CalibrationResult:
     """`reached` with the schema version of `recorded`, for a comparison byte by byte: a recording by an earlier version
-    of the program holds that version, and may lack intrinsics, their hash or the lens, which is no difference in the
-    decision."""
+    of the program holds that version, and may lack intrinsics, their hash, the lens or the cues, which is no difference
+    in the decision."""
     intrinsics = None if recorded.intrinsics is None else reached.intrinsics
     if recorded.intrinsics is not None and recorded.intrinsics.sha256 is None and intrinsics is not None:
         intrinsics = intrinsics.model_copy(update={"sha256": None})
     lens = None if recorded.lens is None else reached.lens
-    changes = {"schema_version": recorded.schema_version, "intrinsics": intrinsics, "lens": lens}
+    cues = None if recorded.cues is None else reached.cues
+    changes = {"schema_version": recorded.schema_version, "intrinsics": intrinsics, "lens": lens, "cues": cues}
     return reached.model_copy(update=changes)
 
 
@@ -225,6 +234,10 @@ def estimate_of(result: replies.CalibrationResult) -> Estimate:
         config_hash=result.config_hash,
         moved=None if result.moved is None else _moved_within(result.moved),
         lens=None if result.lens is None else _lens_estimate(result.lens),
+        cues=tuple(
+            CueShare(name, cue.samples, cue.weight, _or_nan(cue.significance), _array(cue.share))
+            for name, cue in (result.cues or {}).items()
+        ),
     )
 
 

@@ -14,8 +14,8 @@ from coec.io.depth.depth_maps import STEREO
 from coec.io.exported_extrinsic import REFUSED
 from coec.reports import console, lens_report, page_parts
 from coec.reports.formatting import count, number, percent, second, significant, size
-from coec.reports.page import AxesTable, Block, Facts, Page, Section, Text, VerdictBanner
-from coec.schemas.replies import CalibrationReport, CalibrationResult, Transform, Vector6
+from coec.reports.page import AxesTable, Block, Facts, Page, Section, Table, Text, VerdictBanner
+from coec.schemas.replies import CalibrationReport, CalibrationResult, Cue, Transform, Vector6
 
 DIGITS = 9
 """Decimal places of a matrix and a quaternion to copy: a rotation is then exact to 1e-9 rad, far below any σ. `--json`
@@ -78,6 +78,8 @@ def show(
         console.show(
             f"{result.pairs} pairs are worth {result.independent_looks:.1f} independent looks{_together(result)}"
         )
+    if result.cues is not None:
+        console.show(_cues_text(result.cues))
     stages = "  ".join(f"{stage} {seconds:.2f} s" for stage, seconds in elapsed_s.items())
     console.show(f"{result.evaluations} evaluations, {result.stop_reason}; {stages}")
 
@@ -175,6 +177,39 @@ def _together(result: CalibrationResult) -> str:
     return f"; correlation of errors: {correlations}" if correlations else ""
 
 
+REFLECTANCE_EDGES = "reflectance_edges"
+NO_REFLECTANCE = "no reflectance edges: the sweeps carry no intensity, a constant one, or one without steps"
+
+
+def _cues_text(cues: Mapping[str, Cue]) -> str:
+    """Which cues the result rests on, and why one is missing."""
+    present = ", ".join(f"{name.replace('_', ' ')} {significant(cue.significance)} σ" for name, cue in cues.items())
+    return f"cues, each by itself: {present}" + ("" if REFLECTANCE_EDGES in cues else f"; {NO_REFLECTANCE}")
+
+
+def _cues_table(cues: Mapping[str, Cue]) -> Table:
+    caption = (
+        "What each cue contributed: its significance by itself, the weight of its samples, and its share of the "
+        "curvature of the objective along each axis."
+    )
+    rows = tuple(
+        (
+            name.replace("_", " "),
+            str(cue.samples),
+            f"{significant(cue.significance)} σ",
+            number(cue.weight, 2),
+            *("–" if share is None else percent(share) for share in cue.share),
+        )
+        for name, cue in cues.items()
+    )
+    return Table(
+        caption if REFLECTANCE_EDGES in cues else f"{caption} There are {NO_REFLECTANCE}.",
+        ("cue", "samples", "significance", "weight", *console.AXIS_NAMES),
+        rows,
+        numbers=frozenset(range(1, 10)),
+    )
+
+
 def _offset_text(offset: Mapping[str, Any]) -> str:
     if not offset["observable"]:
         return f"not observable, {offset['reason']}"
@@ -220,7 +255,7 @@ def calibration_page(
                 page_parts.figures_block("Figures of self-diagnosis", report.metrics),
             ),
         ),
-        Section("How it was found", (_search(report),)),
+        Section("How it was found", (_search(report), *((_cues_table(report.cues),) if report.cues else ()))),
         made.section(_origin(report, window)),
     )
     verdict = _verdict(report)

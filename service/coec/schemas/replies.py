@@ -158,6 +158,17 @@ class MovedWithin(Part):
     after: Transform = Field(description="camera_from_lidar that fits the pairs after the move, estimated likewise")
 
 
+class Cue(Part):
+    """What one cue contributed to a result."""
+
+    samples: Count = Field(description="edges of the window, or points in view")
+    weight: float = Field(description="of its samples, relative to those of the other kind of edges, 0 to 1")
+    significance: float | None = Field(description="of this cue alone at the result, standard deviations")
+    share: Maybe6 = Field(
+        description="of the curvature of the objective, 0 to 1: rx ry rz tx ty tz; null on axes that were not searched"
+    )
+
+
 class CalibrationResult(Message):
     """The result of calibrating one window; the same in the state, the history, the window's file and `coec
     calibrate`."""
@@ -216,6 +227,11 @@ class CalibrationResult(Message):
     lens: Lens | None = Field(
         default=None,
         description="what the window says of the lens; null: the objective uses no edges, or they determine no pose, "
+        "or the writer is of an earlier version",
+    )
+    cues: dict[Text, Cue] | None = Field(
+        default=None,
+        description="what range_edges, reflectance_edges and depth contributed; null: the objective has one cue only, "
         "or the writer is of an earlier version",
     )
 

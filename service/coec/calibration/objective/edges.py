@@ -79,7 +79,8 @@ Edges = TypeVar("Edges", EdgeFrames, EdgeCharts)
 RANGE, REFLECTANCE = 0, 1
 """Kinds of edges of a sweep."""
 
-KINDS = 2
+KIND_NAMES = ("range_edges", "reflectance_edges")
+KINDS = len(KIND_NAMES)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.objective import mutual_information
-from coec.calibration.objective.edges import EdgeCue, in_reach
+from coec.calibration.objective.edges import KIND_NAMES, KINDS, EdgeCue, in_reach
 from coec.calibration.search.global_search import sample_reach
-from coec.calibration.types import Matrix4
+from coec.calibration.types import CueShare, Matrix4
+from coec.geometry import se3
 from coec.geometry.cameras import in_image
 from coec.geometry.edges import alignment
 from coec.geometry.edges.charts import charted_significances
@@ -135,6 +136,29 @@ class FusedObjective:
 
         points = mutual_information.PointsInView(p_camera[seen], edges.weight[seen].astype(np.float64), frame[seen])
         return mutual_information.Cells(at, CELL_STEP * self._step_rad, points)
+
+    def cue_shares(self, cue: EdgeCue, T_camera_lidar: Matrix4, dof: int) -> tuple[CueShare, ...]:
+        """What range edges, reflectance edges and depth contribute near a pose (4, 4); `cue` has the edges of this
+        objective, `dof` of its axes were searched."""
+        moves = np.vstack([np.zeros(6), np.diag(se3.axis_steps(self._step_rad))[:dof]])
+        poses = np.array([se3.perturb(T_camera_lidar, sign * move) for sign in (1.0, -1.0) for move in moves])
+        sums = alignment.alignment_of_parts(cue.sharp, cue.kinds[0], KINDS, poses)
+        scale = sqrt(max(float(sums.square[0].sum()), alignment.LEAST_SQUARE)) * self._of_edges.deviation
+        depth = self._depth.evaluate_each(poses)
+        of_depth = np.array([at.score for at in depth]) / self._of_depth.deviation
+        scores = np.column_stack([sums.strength.sum(axis=1) / scale, of_depth]).reshape(2, 1 + dof, KINDS + 1)
+        curvature = np.maximum(2.0 * scores[0, 0] - scores[0, 1:] - scores[1, 1:], 0.0)
+        total = curvature.sum(axis=1)
+        shares = np.full((6, KINDS + 1), np.nan)
+        shares[:dof][total > 0.0] = curvature[total > 0.0] / total[total > 0.0, None]
+        alone = cue.significances(cue.sharp, T_camera_lidar)
+        of_edges = tuple(
+            CueShare(name, cue.count(kind), float(cue.balance[kind]), float(alone[kind]), shares[:, kind])
+            for kind, name in enumerate(KIND_NAMES)
+            if cue.count(kind)
+        )
+        standing_out = self._of_depth.standard(depth[0].score)
+        return (*of_edges, CueShare("depth", depth[0].points_in_view, 1.0, standing_out, shares[:, KINDS]))
 
 
 class Fusion:
