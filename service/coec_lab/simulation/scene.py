@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from coec.geometry.compiler import njit
 from coec_lab.simulation.mesh import Floats, Mesh, join
 from coec_lab.simulation.passages import Bore, Passages
+from coec_lab.simulation.reflectance import infrared
 from coec_lab.simulation.road import MODELS, Mover, Progress, Road, build_road
 from coec_lab.simulation.street import NO_PASSAGES, STRETCH_M, Stretch, backdrop
 from coec_lab.simulation.surroundings import Street, Surroundings
@@ -76,7 +77,8 @@ class Scene:
     Attributes:
         origin_m: (3,) world position that is the origin of its meshes.
         street: everything that stands still, without the models of cars.
-        colour, material: (T, 3) float32 and (T,) int8 of all triangles: the street, then each model of car.
+        colour, material, infrared: (T, 3) float32, (T,) int8 and (T,) float32 (see `reflectance.infrared`) of all
+            triangles: the street, then each model of car.
         sky: light and weather.
         movers: moving cars near the place, at the instant for which the scene was requested.
         headlights: (L, 4, 3) of the vehicle, see `lamps.headlights`; none by day.
@@ -98,6 +100,7 @@ class Scene:
         self._first = np.cumsum([len(street.colour)] + [len(model.mesh.colour) for model in models])
         self.colour = np.concatenate([street.colour, *(model.mesh.colour for model in models)])
         self.material = np.concatenate([street.material, *(model.mesh.material for model in models)])
+        self.infrared = infrared(self.colour, self.material)
 
     def cast(self, origins_m: Doubles, directions: Floats, time_s: ArrayLike, reach_m: float = 400.0) -> Hits:
         """The first surface along each ray.
