@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from coec.geometry.compiler import njit
 from coec_lab.simulation.mesh import Floats, Material
-from coec_lab.simulation.textures import SALTS, octave
+from coec_lab.simulation.textures import BEADED, MARKING, SALTS, octave
 from coec_lab.simulation.textures import texture as texture_at
 
 Doubles = NDArray[np.float64]
@@ -111,6 +111,8 @@ _TEXTURE = _of_materials(
 """Contrast of a texture for the laser, relative to that for the camera."""
 _BLOTCH, _BLOTCH_M = 0.15, 0.8
 """Contrast and size of blotches that only the laser sees: damp, dust, old paint."""
+_AGEING, _AGEING_M = 1.0, 40.0
+"""The same of painted markings, whose beads wear off before the paint does."""
 _WETTED = np.isin(np.arange(len(Material)), [Material.ASPHALT, Material.PAVING, Material.CONCRETE, Material.MARKING,
                                              Material.BEADED])  # fmt: skip
 CARBON_BLACK, CARBON_SHARE = 0.06, 0.7
@@ -199,8 +201,10 @@ def _textured(
         foot = footprint[i]
         kind = material[i]
         seen = texture_at(kind, u, v, foot) - 1.0
-        own = octave(u, v, _BLOTCH_M, foot, SALTS[45])
-        out[i] = max(1.0 + contrast[kind] * seen + 2.0 * _BLOTCH * own, 0.1)
+        own = 2.0 * _BLOTCH * octave(u, v, _BLOTCH_M, foot, SALTS[45])
+        if kind in (MARKING, BEADED):
+            own += _AGEING * octave(u, v, _AGEING_M, foot, SALTS[46])
+        out[i] = max(1.0 + contrast[kind] * seen + own, 0.1)
 
 
 def lost_on_water(

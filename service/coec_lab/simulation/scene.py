@@ -23,6 +23,7 @@ BEHIND, AHEAD = 3, 4
 RAYS_AT_ONCE = 1 << 18
 """Rays per call of Embree, which bounds the memory for an image of any size."""
 MISSED = -1
+NO_LAMPS = np.empty((0, 3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,19 +82,22 @@ class Scene:
             triangles: the street, then each model of car.
         sky: light and weather.
         movers: moving cars near the place, at the instant for which the scene was requested.
-        headlights: (L, 4, 3) of the vehicle, see `lamps.headlights`; none by day.
+        headlights: (L, 4, 3) of the vehicle, see `shading.headlights`; none by day.
+        lamps_m: (K, 3) street lamps, world; they shine when the headlights do.
         bores: the tunnels of the road.
     """
 
     def __init__(
-        self, road: Road, sky: Sky, origin_m: Doubles, street: Mesh, models: list[Solid], bores: tuple[Bore, ...] = ()
-    ) -> None:
+        self, road: Road, sky: Sky, origin_m: Doubles, street: Mesh, models: list[Solid], bores: tuple[Bore, ...] = (),
+        lamps_m: Doubles = NO_LAMPS,
+    ) -> None:  # fmt: skip
         self.road = road
         self.sky = sky
         self.origin_m = origin_m
         self.movers: tuple[Mover, ...] = ()
         self.headlights: Doubles = np.empty((0, 4, 3))
         self.bores = bores
+        self.lamps_m = lamps_m
         self.street = street
         self._solid = Solid(street)
         self._models = models
@@ -221,7 +225,8 @@ class Town:
             parts.append(Mesh(stretch.mesh.corners_m + shift, stretch.mesh.colour, stretch.mesh.material))
         lowest = min(float(mesh.corners_m[:, :, 2].min()) for mesh in parts)
         street = join([*parts, backdrop().placed(0, 0, min(lowest, 0.0), 0)])
-        return Scene(self.road, self.sky, origin, street, self._models, self._bores)
+        lamps_m = np.concatenate([stretch.lamps_m + stretch.origin_m for stretch in stretches.values()])
+        return Scene(self.road, self.sky, origin, street, self._models, self._bores, lamps_m)
 
     def _on_cleared(self, mover: Mover, time_s: float) -> bool:
         place_m = float(mover.progress(np.array([time_s]))[0])

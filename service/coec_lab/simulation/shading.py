@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from coec.calibration.types import Matrix4
 from coec.geometry.compiler import PRANGE, njit, prange
-from coec_lab.simulation.mesh import Floats
+from coec_lab.simulation.mesh import Floats, Material
 from coec_lab.simulation.passages import SPINE_M
 from coec_lab.simulation.scene import Hits, Scene
-from coec_lab.simulation.textures import FOLIAGE, GLASS, LACQUER, LAMP, SALTS, noise, texture
+from coec_lab.simulation.textures import FOLIAGE, GLASS, LACQUER, LAMP, LIT, SALTS, hashed, noise, texture
 from coec_lab.simulation.weather import Sky
 
 Doubles = NDArray[np.float64]
@@ -30,6 +30,16 @@ BEAM_LIGHT_M2, BEAM_SPILL = 12.0, 0.02
 """A dipped beam: light on its axis times the square of the distance, and the share that goes everywhere ahead."""
 BEAM_DOWN_RAD, BEAM_WIDE_RAD, BEAM_HIGH_RAD, BEAM_CUT_RAD = 0.02, 0.45, 0.14, 0.015
 """How far its axis points below the horizon; its width to the sides, below and above the axis, to 1/e of the light."""
+LAMP_LIGHT_M2, LAMP_REACH_M, LAMP_GLOW_M, LAMP_GLOW = 2.0, 25.0, 0.7, 1.5
+"""A street lamp: light straight below it times the square of the distance, how far it reaches; within how far its own
+head glows, and its light there."""
+HEADLIGHT_GAIN = np.ones(len(Material), np.float32)
+"""Share of the light of the vehicle's own headlights that comes back to its camera, relative to a matt surface."""
+HEADLIGHT_GAIN[[Material.RETRO, Material.BEADED]] = 40.0, 5.0
+LIT_RADIANCE = 0.3
+"""Radiance of a vehicle's lamp of white colour."""
+WINDOW_LIGHT, WINDOWS_LIT = (0.04, 0.08, 0.12), 0.2
+"""Radiance of a window with light behind it, and the share of such windows at night."""
 NIGHT = 0.002
 """Light of the sky at night over a town, as a share of daylight; a camera sees no colour in it."""
 
@@ -49,7 +59,10 @@ def incident(scene: Scene, origin_m: Doubles, directions: Floats, hits: Hits) ->
         _in_bore(origin, directions, hits.range_m, hits.normal, room.spine, room.half_m,
                  room.high_m, room.light, share, lamps)  # fmt: skip
     if len(scene.headlights):
-        _headlit(origin, directions, hits.range_m, hits.normal, scene.headlights, lamps)
+        gain = np.where(hits.triangle < 0, np.float32(1.0), HEADLIGHT_GAIN[scene.material[hits.triangle]])
+        _headlit(origin, directions, hits.range_m, hits.normal, scene.headlights, gain, lamps)
+        if len(scene.lamps_m):
+            _lamplit(origin, directions, hits.range_m, hits.normal, scene.lamps_m, lamps)
     return Incident(share, lamps)
 
 
@@ -108,7 +121,7 @@ def _in_bore(
 
 @njit(cache=True, parallel=PRANGE)
 def _headlit(
-    origin: Doubles, directions: Floats, range_m: Floats, normal: Floats, beams: Doubles, lamps: Floats
+    origin: Doubles, directions: Floats, range_m: Floats, normal: Floats, beams: Doubles, gain: Floats, lamps: Floats
 ) -> None:
     for i in prange(len(directions)):
         r = float(range_m[i])
@@ -131,7 +144,36 @@ def _headlit(
             over = math.atan2(up, math.sqrt(ahead * ahead + left * left)) + BEAM_DOWN_RAD
             over /= BEAM_CUT_RAD if over > 0.0 else BEAM_HIGH_RAD
             beam = math.exp(-across * across - over * over) + BEAM_SPILL
-            lamps[i] += BEAM_LIGHT_M2 * beam * facing / squared
+            lamps[i] += gain[i] * BEAM_LIGHT_M2 * beam * facing / squared
+
+
+@njit(cache=True, parallel=PRANGE)
+def _lamplit(
+    origin: Doubles, directions: Floats, range_m: Floats, normal: Floats, lamps_m: Doubles, lamps: Floats
+) -> None:
+    for i in prange(len(directions)):
+        r = float(range_m[i])
+        if not r < 1e6:
+            continue
+        px, py, pz = (
+            origin[0] + r * directions[i, 0],
+            origin[1] + r * directions[i, 1],
+            origin[2] + r * directions[i, 2],
+        )
+        for k in range(len(lamps_m)):
+            x, y = lamps_m[k, 0] - px, lamps_m[k, 1] - py
+            flat = x * x + y * y
+            if flat > LAMP_REACH_M * LAMP_REACH_M:
+                continue
+            z = lamps_m[k, 2] - pz
+            squared = flat + z * z
+            if squared < LAMP_GLOW_M * LAMP_GLOW_M:
+                lamps[i] += LAMP_GLOW
+                continue
+            away = math.sqrt(squared)
+            facing = (x * normal[i, 0] + y * normal[i, 1] + z * normal[i, 2]) / away
+            if facing > 0.0 and z > 0.0:
+                lamps[i] += LAMP_LIGHT_M2 * (z / away) * facing / squared
 
 
 DAY_HORIZON = 0.5
@@ -248,6 +290,7 @@ def _shade(
     pixel_rad: float,
     out: Floats,
 ) -> None:
+    dark = light[3, 1] < 5.0 * NIGHT
     for i in prange(len(directions)):
         dx, dy, dz = float(directions[i, 0]), float(directions[i, 1]), float(directions[i, 2])
         colour = np.empty(3)
@@ -286,6 +329,14 @@ def _shade(
         if kind == LAMP:
             for c in range(3):
                 colour[c] = LAMP_RADIANCE
+        elif kind == LIT:
+            for c in range(3):
+                colour[c] += LIT_RADIANCE * paint[t, c]
+        elif kind == GLASS and dark and abs(nz) < 0.05:
+            # Each pane has a tone of its own, which says whether there is light behind it.
+            lot = hashed(np.int64(paint[t, 0] * 1e5), np.int64(paint[t, 2] * 1e5), SALTS[41])
+            for c in range(3):
+                colour[c] += WINDOW_LIGHT[c] if lot < WINDOWS_LIT else 0.0
         air = math.exp(-r / haze_m)
         for c in range(3):  # the air shines with the light that falls into it
             out[i, c] = colour[c] * air + (1 - air) * light[3, c] * 0.95 * sky_share[i]

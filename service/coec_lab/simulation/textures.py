@@ -13,7 +13,7 @@ from coec.geometry.compiler import njit
 # The numbers of `Material`, as constants of the compiled code.
 ASPHALT, PAVING, GRASS, BRICK, PLASTER, GLASS, LACQUER, FOLIAGE, BARK, TILES, MARKING = range(1, 12)
 RUBBER, CONCRETE = 13, 14
-LAMP = 16
+LAMP, RETRO, BEADED, LIT = range(16, 20)
 
 SALTS = np.arange(64)
 """Numbers that make one noise differ from another. They are in an array because the compiler compiles a function anew
@@ -95,7 +95,7 @@ def texture(kind: int, u: float, v: float, foot: float) -> float:
         return (1.0 - 0.45 * max(line(v, 0.3, 0.04, foot), 0.6 * line(u, 0.22, 0.03, foot))) * (
             1.0 + 0.3 * octave(u, v, 0.3, foot, SALTS[20]) + 0.3 * octave(u, v, 2.0, foot, SALTS[21])
         )
-    if kind == MARKING:
+    if kind in (MARKING, BEADED):
         worn = octave(u, v, 0.3, foot, SALTS[22]) + octave(u, v, 0.05, foot, SALTS[23])
         return 1.0 + 0.35 * worn
     return 1.0 + 0.08 * octave(u, v, 0.6, foot, SALTS[24])
