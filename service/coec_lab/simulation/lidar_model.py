@@ -262,8 +262,8 @@ def sweep(
         alive &= ~np.tile(dead, columns)
     seen &= alive
     noise = rng.normal(0.0, model.noise_m, len(range_m))
-    own_rng = rng.spawn(1)[0]
-    _shade(model, scene, echoes, hits, origins, turned, cosine, seen, air, own_rng)
+    water, values = rng.spawn(2)  # streams of their own, so that they change no range
+    _shade(model, scene, echoes, hits, origins, turned, cosine, seen, air, water)
     if air.drops:
         _rained(air, model, echoes, seen, rng)
     _bloom(echoes, seen, alive, columns)
@@ -271,7 +271,7 @@ def sweep(
     intensity = None
     if model.intensity is not None:
         gain = np.tile(np.ones(beams) if gains is None else gains, columns)[seen]
-        intensity = reflectance.values(model.intensity, echoes.light[seen], range_m[seen], gain, own_rng)
+        intensity = reflectance.values(model.intensity, echoes.light[seen], range_m[seen], gain, values)
     return Sweep(
         (flat[seen] * measured[:, None]).astype(np.float32),
         intensity,

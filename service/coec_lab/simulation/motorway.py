@@ -201,8 +201,8 @@ def _sheet(x_m: float, right_m: float, left_m: float, low_m: float, high_m: floa
 def _letter(rng: np.random.Generator, left_m: float, low_m: float, size_m: float, ink: Colour) -> list[Sheet]:
     """Some of the strokes of a letter."""
     wide, stroke = 0.5 * size_m, 0.17 * size_m
-    strokes = [(0, stroke, 0, size_m), (wide - stroke, wide, 0, size_m)]
-    strokes += [(0, wide, up, up + stroke) for up in (0.0, (size_m - stroke) / 2, size_m - stroke)]
+    strokes = [(0.0, stroke, 0.0, size_m), (wide - stroke, wide, 0.0, size_m)]
+    strokes += [(0.0, wide, up, up + stroke) for up in (0.0, (size_m - stroke) / 2, size_m - stroke)]
     chosen = [one for one in strokes if rng.random() < 0.65]
     return [_sheet(-0.02, left_m - b, left_m - a, low_m + low, low_m + up, ink) for a, b, low, up in chosen]
 

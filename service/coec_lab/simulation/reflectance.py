@@ -141,7 +141,7 @@ def infrared(colour: Floats, material: NDArray[np.int8]) -> Floats:
     result[is_fixed] = fixed[is_fixed]
     sheet = np.isin(material, [Material.SIGN, Material.RETRO])
     result[sheet] = colour[sheet].max(axis=1) ** 1.5  # print on sheeting hides what reflects
-    return result.astype(np.float32)
+    return np.asarray(result, np.float32)
 
 
 def _lot(colour: Floats) -> Doubles:
