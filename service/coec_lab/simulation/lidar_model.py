@@ -234,25 +234,14 @@ def sweep(
         gains: (beams,) see `reflectance.beam_gains`; None: all are 1.
     """
     beams = model.pattern.beams
-    fired = model.pattern.fired(time_s, model.period_s)
-    rays, offset_s = fired.rays, fired.offset_s
-    columns = len(offset_s)
-    pose = poses(time_s + offset_s)
-    times = np.repeat(time_s + offset_s, beams)
-    origins = np.repeat(pose[:, :3, 3], beams, axis=0)
-
-    def cast(local: Doubles, selected: NDArray[np.int64]) -> Hits:
-        turned = np.einsum("nij,nj->ni", pose[selected // beams, :3, :3], local).astype(np.float32)
-        return scene.cast(origins[selected], turned, times[selected], model.reach_m)
-
-    flat = rays.reshape(-1, 3)
-    turned = np.einsum("nij,nj->ni", np.repeat(pose[:, :3, :3], beams, axis=0), flat)
-    hits = scene.cast(origins, turned.astype(np.float32), times, model.reach_m)
-    cosine: Doubles = np.abs(np.einsum("ni,ni->n", turned, hits.normal.astype(np.float64)))
+    rays = _Rays.of(model, poses, time_s)
+    columns = len(rays.offset_s)
+    hits = scene.cast(rays.origins, rays.turned.astype(np.float32), rays.times, model.reach_m)
+    cosine: Doubles = np.abs(np.einsum("ni,ni->n", rays.turned, hits.normal.astype(np.float64)))
     echoes = _Echoes(hits.range_m.astype(np.float64), _reflectance(scene, hits) * cosine, _light(scene, hits, cosine))
     edge = np.flatnonzero(_jumps(echoes.range_m.reshape(columns, beams)).ravel())
     if len(edge):
-        echoes.put(edge, _cones(model, flat[edge], edge, echoes.part(edge), cast, scene))
+        echoes.put(edge, _cones(model, scene, rays, edge, echoes.part(edge)))
     range_m = echoes.range_m
     with np.errstate(invalid="ignore"):
         echo = echoes.strength / range_m**2 * np.exp(-2.0 * air.extinction_per_m * range_m)
@@ -263,7 +252,7 @@ def sweep(
     seen &= alive
     noise = rng.normal(0.0, model.noise_m, len(range_m))
     water, values = rng.spawn(2)  # streams of their own, so that they change no range
-    _shade(model, scene, echoes, hits, origins, turned, cosine, seen, air, water)
+    _shade(model, scene, echoes, hits, rays, cosine, seen, air, water)
     if air.drops:
         _rained(air, model, echoes, seen, rng)
     _bloom(echoes, seen, alive, columns)
@@ -273,11 +262,43 @@ def sweep(
         gain = np.tile(np.ones(beams) if gains is None else gains, columns)[seen]
         intensity = reflectance.values(model.intensity, echoes.light[seen], range_m[seen], gain, values)
     return Sweep(
-        (flat[seen] * measured[:, None]).astype(np.float32),
+        (rays.local[seen] * measured[:, None]).astype(np.float32),
         intensity,
         np.tile(np.arange(beams, dtype=np.uint16), columns)[seen] if model.pattern.ringed else None,
-        np.repeat(offset_s, beams)[seen].astype(np.float32),
+        np.repeat(rays.offset_s, beams)[seen].astype(np.float32),
     )
+
+
+class _Rays(NamedTuple):
+    """N rays of a sweep, column after column.
+
+    Attributes:
+        local, turned: (N, 3) float64 directions in the axes of the LiDAR and of the world.
+        origins: (N, 3) world.
+        times: (N,) when each is cast, seconds.
+        pose, offset_s: (columns, 4, 4) and (columns,), see `sweep` and `Fired`.
+    """
+
+    local: Doubles
+    turned: Doubles
+    origins: Doubles
+    times: Doubles
+    pose: Doubles
+    offset_s: Doubles
+
+    @classmethod
+    def of(cls, model: LidarModel, poses: Callable[[Doubles], Doubles], time_s: float) -> "_Rays":
+        beams = model.pattern.beams
+        rays, offset_s = model.pattern.fired(time_s, model.period_s)
+        times = time_s + offset_s
+        pose, local = poses(times), rays.reshape(-1, 3)
+        turned = np.einsum("nij,nj->ni", np.repeat(pose[:, :3, :3], beams, axis=0), local)
+        return cls(local, turned, np.repeat(pose[:, :3, 3], beams, axis=0), np.repeat(times, beams), pose, offset_s)
+
+    def cast_offset(self, scene: Scene, model: LidarModel, selected: NDArray[np.intp], local: Doubles) -> Hits:
+        """As if the selected rays had these directions."""
+        turned = np.einsum("nij,nj->ni", self.pose[selected // model.pattern.beams, :3, :3], local).astype(np.float32)
+        return scene.cast(self.origins[selected], turned, self.times[selected], model.reach_m)
 
 
 class _Echoes(NamedTuple):
@@ -297,19 +318,19 @@ class _Echoes(NamedTuple):
 
 
 def _shade(
-    model: LidarModel, scene: Scene, echoes: _Echoes, hits: Hits, origins: Doubles, turned: Doubles, cosine: Doubles,
+    model: LidarModel, scene: Scene, echoes: _Echoes, hits: Hits, rays: _Rays, cosine: Doubles,
     seen: NDArray[np.bool_], air: Air, rng: np.random.Generator,
 ) -> None:  # fmt: skip
     """Puts textures into the light of the returns, in place, and removes those that a wet road mirrors away."""
-    rays = np.flatnonzero(seen & (hits.triangle >= 0))
-    material, normal = scene.material[hits.triangle[rays]], hits.normal[rays]
+    lit = np.flatnonzero(seen & (hits.triangle >= 0))
+    material, normal = scene.material[hits.triangle[lit]], hits.normal[lit]
     if air.wetness:
-        gone = reflectance.lost_on_water(cosine[rays], normal, material, air.wetness, rng)
-        seen[rays[gone]] = False
-    range_m = hits.range_m[rays].astype(np.float64)
-    points = origins[rays] + range_m[:, None] * turned[rays]
-    footprint = 2.0 * model.divergence_rad * range_m / np.sqrt(np.maximum(cosine[rays], 0.02))
-    echoes.light[rays] *= reflectance.texture(points, normal, material, footprint, air.wetness)
+        gone = reflectance.lost_on_water(cosine[lit], normal, material, air.wetness, rng)
+        seen[lit[gone]] = False
+    range_m = hits.range_m[lit].astype(np.float64)
+    points = rays.origins[lit] + range_m[:, None] * rays.turned[lit]
+    footprint = 2.0 * model.divergence_rad * range_m / np.sqrt(np.maximum(cosine[lit], 0.02))
+    echoes.light[lit] *= reflectance.texture(points, normal, material, footprint, air.wetness)
 
 
 def _rained(air: Air, model: LidarModel, echoes: _Echoes, seen: NDArray[np.bool_], rng: np.random.Generator) -> None:
@@ -356,12 +377,10 @@ def _jumps(range_m: Doubles) -> NDArray[np.bool_]:
     return result
 
 
-def _cones(
-    model: LidarModel, flat: Doubles, selected: NDArray[np.int64], middle: _Echoes,
-    cast: Callable[[Doubles, NDArray[np.int64]], Hits], scene: Scene,
-) -> _Echoes:  # fmt: skip
+def _cones(model: LidarModel, scene: Scene, rays: _Rays, selected: NDArray[np.intp], middle: _Echoes) -> _Echoes:
     """Echoes of beams as cones: the strongest echo, mixed with the echoes within a pulse's length of it."""
     ranges, strengths, lights = [middle.range_m], [middle.strength], [middle.light]
+    flat = rays.local[selected]
     side = np.column_stack([-flat[:, 1], flat[:, 0], np.zeros(len(flat))])
     side /= np.linalg.norm(side, axis=1)[:, None]
     above = np.cross(flat, side)
@@ -369,7 +388,7 @@ def _cones(
     for across, over in SPREAD:
         ray = flat + model.divergence_rad * (across * side + over * above)
         ray /= np.linalg.norm(ray, axis=1)[:, None]
-        hits = cast(ray, selected)
+        hits = rays.cast_offset(scene, model, selected, ray)
         ranges.append(hits.range_m.astype(np.float64))
         strengths.append(_reflectance(scene, hits) * np.where(np.isfinite(hits.range_m), 0.7, 0.0))
         lights.append(_light(scene, hits, slant))
@@ -387,7 +406,9 @@ def _cones(
         held = (member * weight).sum(axis=1) / total
     inside = member > 0
     share = inside.sum(axis=1) / echo.shape[1]
-    found = total > 0
+    returned = total > 0
     return _Echoes(
-        np.where(found, mixed, np.inf), np.where(found, held * share, 0.0), (light * inside).sum(axis=1) / echo.shape[1]
+        np.where(returned, mixed, np.inf),
+        np.where(returned, held * share, 0.0),
+        (light * inside).sum(axis=1) / echo.shape[1],
     )

@@ -64,7 +64,7 @@ def furnish(rng: np.random.Generator, site: Site, length_m: float, seed: int) ->
     _rail(site, s, 0.0, length_m)
     _worn(more, site, s, grey)
     for side in (-1.0, 1.0):
-        _beside(more, site, length_m, side, seed)
+        _roadside(more, site, length_m, side, seed)
     _across(more, site, length_m)
 
 
@@ -110,7 +110,7 @@ def _worn(rng: np.random.Generator, site: Site, s: Doubles, grey: Doubles) -> No
             site.meshes += [quads(shaft, WHITE, Material.BEADED), quads(tip, WHITE, Material.BEADED)]
 
 
-def _beside(rng: np.random.Generator, site: Site, length_m: float, side: float, seed: int) -> None:
+def _roadside(rng: np.random.Generator, site: Site, length_m: float, side: float, seed: int) -> None:
     """Barriers, trees, large signs and emergency telephones of one side."""
     region = round(site.begin_m / length_m) // REGION
     kind = np.random.default_rng([seed, 110, region + 2**20, int(side > 0)]).random()
@@ -203,8 +203,8 @@ def _letter(rng: np.random.Generator, left_m: float, low_m: float, size_m: float
     wide, stroke = 0.5 * size_m, 0.17 * size_m
     strokes = [(0.0, stroke, 0.0, size_m), (wide - stroke, wide, 0.0, size_m)]
     strokes += [(0.0, wide, up, up + stroke) for up in (0.0, (size_m - stroke) / 2, size_m - stroke)]
-    chosen = [one for one in strokes if rng.random() < 0.65]
-    return [_sheet(-0.02, left_m - b, left_m - a, low_m + low, low_m + up, ink) for a, b, low, up in chosen]
+    visible = [one for one in strokes if rng.random() < 0.65]
+    return [_sheet(-0.02, left_m - b, left_m - a, low_m + low, low_m + up, ink) for a, b, low, up in visible]
 
 
 def vehicle(rng: np.random.Generator) -> Mesh:

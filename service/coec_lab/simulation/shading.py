@@ -272,6 +272,21 @@ def _reflect(
         colour[c] = colour[c] * (1 - shiny) + shiny * mirrored[c] + spot * light[1, c]
 
 
+@njit(cache=True)
+def _emit(kind: int, paint: Floats, colour: Doubles) -> None:
+    """Adds to `colour` the light of lamps, and of windows with light behind them."""
+    if kind == LAMP:
+        for c in range(3):
+            colour[c] = LAMP_RADIANCE
+    elif kind == LIT:
+        for c in range(3):
+            colour[c] += LIT_RADIANCE * paint[c]
+    # Each pane has a tone of its own, which says whether there is light behind it.
+    elif hashed(np.int64(paint[0] * 1e5), np.int64(paint[2] * 1e5), SALTS[41]) < WINDOWS_LIT:
+        for c in range(3):
+            colour[c] += WINDOW_LIGHT[c]
+
+
 @njit(cache=True, parallel=PRANGE)
 def _shade(
     origin: Doubles,
@@ -326,17 +341,8 @@ def _shade(
             colour[c] = paint[t, c] * factor * (light[1, c] * sunny + ambient * sky_share[i] + lamps[i])
         if shiny > 0.0:
             _reflect(kind, shiny, dx, dy, dz, nx, ny, nz, u, v, light, clouds, sky_share[i], shadowed[i], colour)
-        if kind == LAMP:
-            for c in range(3):
-                colour[c] = LAMP_RADIANCE
-        elif kind == LIT:
-            for c in range(3):
-                colour[c] += LIT_RADIANCE * paint[t, c]
-        elif kind == GLASS and dark and abs(nz) < 0.05:
-            # Each pane has a tone of its own, which says whether there is light behind it.
-            lot = hashed(np.int64(paint[t, 0] * 1e5), np.int64(paint[t, 2] * 1e5), SALTS[41])
-            for c in range(3):
-                colour[c] += WINDOW_LIGHT[c] if lot < WINDOWS_LIT else 0.0
+        if kind in (LAMP, LIT) or (kind == GLASS and dark and abs(nz) < 0.05):
+            _emit(kind, paint[t], colour)
         air = math.exp(-r / haze_m)
         for c in range(3):  # the air shines with the light that falls into it
             out[i, c] = colour[c] * air + (1 - air) * light[3, c] * 0.95 * sky_share[i]
