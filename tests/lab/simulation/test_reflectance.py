@@ -106,9 +106,9 @@ def test_a_retro_reflector_saturates_and_widens() -> None:
 
     sign, paint = swept(Material.SIGN), swept(Material.PAINT)
     ring = sign.ring == 8
-    beside = ring & (np.abs(np.abs(sign.xyz_m[:, 1]) - 0.53) < 0.03)
+    near_edge = ring & (np.abs(np.abs(sign.xyz_m[:, 1]) - 0.53) < 0.03)
     assert read(sign)[ring & (np.abs(sign.xyz_m[:, 1]) < 0.4)].min() > 200
-    assert np.median(read(sign)[beside]) > np.median(read(paint)[beside]) + 20
+    assert np.median(read(sign)[near_edge]) > np.median(read(paint)[near_edge]) + 20
 
     def width_m(material: Material) -> float:
         detected = measured(join([plate(20.0, 0.5, LIGHT, material), plate(40.0, 8.0, LIGHT, Material.PLASTER)]))
@@ -163,17 +163,17 @@ def test_beams_differ_by_the_same_factors_in_every_sweep() -> None:
 
 
 @pytest.mark.usefixtures("streets")
-def test_a_drive_writes_what_it_is_asked_for() -> None:
-    asked = {kind: sweeps(small(seconds=0.2, intensity=kind).messages())[0] for kind in ("raw", "none")}
+def test_a_drive_writes_the_requested_kind() -> None:
+    requested = {kind: sweeps(small(seconds=0.2, intensity=kind).messages())[0] for kind in ("raw", "none")}
     usual = sweeps(small(seconds=0.2).messages())[0]
     again = sweeps(small(seconds=0.2).messages())[0]
-    assert asked["none"].intensity is None
-    assert asked["raw"].intensity is not None
-    assert asked["raw"].intensity.max() > 255
+    assert requested["none"].intensity is None
+    assert requested["raw"].intensity is not None
+    assert requested["raw"].intensity.max() > 255
     assert usual.intensity is not None
     assert usual.intensity.max() <= 255
     np.testing.assert_array_equal(usual.intensity, again.intensity)
-    np.testing.assert_array_equal(usual.xyz_m, asked["raw"].xyz_m)
+    np.testing.assert_array_equal(usual.xyz_m, requested["raw"].xyz_m)
 
 
 def test_a_motorway_has_sheeting_beads_and_vehicles_that_overtake() -> None:
