@@ -246,9 +246,8 @@ def sweep(
     with np.errstate(invalid="ignore"):
         echo = echoes.strength / range_m**2 * np.exp(-2.0 * air.extinction_per_m * range_m)
         seen = np.isfinite(range_m) & (range_m > model.nearest_m) & (echo > WEAKEST)
-    alive = rng.random(len(range_m)) >= model.dropout
-    if dead is not None:
-        alive &= ~np.tile(dead, columns)
+    working = np.ones(beams, bool) if dead is None else ~dead
+    alive = (rng.random(len(range_m)) >= model.dropout) & np.tile(working, columns)
     seen &= alive
     noise = rng.normal(0.0, model.noise_m, len(range_m))
     water, values = rng.spawn(2)  # streams of their own, so that they change no range
@@ -260,13 +259,12 @@ def sweep(
     if air.drops:
         _rained(air, model, echoes, seen, rng)
     _bloom(echoes, seen, alive, columns)
-    measured = (range_m + noise)[seen]
     intensity = None
     if model.intensity is not None:
         gain = np.tile(np.ones(beams) if gains is None else gains, columns)[seen]
         intensity = reflectance.values(model.intensity, echoes.light[seen], range_m[seen], gain, values)
     return Sweep(
-        (rays.local[seen] * measured[:, None]).astype(np.float32),
+        (rays.local[seen] * (range_m + noise)[seen, None]).astype(np.float32),
         intensity,
         np.tile(np.arange(beams, dtype=np.uint16), columns)[seen] if model.pattern.ringed else None,
         np.repeat(rays.offset_s, beams)[seen].astype(np.float32),
