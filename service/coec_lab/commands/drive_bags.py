@@ -59,6 +59,7 @@ class DriveOptions:
     stop_s: float = 0.0
     rolling_shutter_s: float = 0.0
     intrinsics_off: str | None = None
+    intensity: str | None = None
     faults: tuple[str, ...] = ()
 
     def query(self) -> dict[str, str]:

@@ -276,6 +276,16 @@ def _exit(status: int) -> None:
 app = typer.Typer(no_args_is_help=True, help="Simulate a vehicle.", result_callback=_exit)
 
 
+Intensity = Annotated[
+    str | None,
+    typer.Option(
+        help="What the LiDAR writes of reflectance: calibrated, reflectivity, raw, coarse or none.",
+        metavar="KIND",
+        show_default="as usual for the LiDAR",
+    ),
+]
+
+
 @app.command("drive")
 def drive(
     output: Annotated[
@@ -296,6 +306,7 @@ def drive(
     lidar: Annotated[
         str, typer.Option(help="Beams: 16, 32, 64, 128; or without rings: raster, rosette.", metavar="LIDAR")
     ] = "64",
+    intensity: Intensity = None,
     scene: SimScene = "street",
     speed_mps: SimSpeed = None,
     go_s: Annotated[float, typer.Option("--go", help="Seconds of driving between two stops.", min=1)] = 20.0,
@@ -333,7 +344,7 @@ def drive(
 
     options = drive_bags.DriveOptions(
         seed, seconds, camera, scene, speed_mps, camera_hz, lidar_hz, workshop, rig, lidar, go_s, stop_s,
-        rolling_shutter_s, intrinsics_off, tuple(faults or ()),
+        rolling_shutter_s, intrinsics_off, intensity, tuple(faults or ()),
     )  # fmt: skip
     write = drive_bags.write_pair if rig is None else drive_bags.write_rig
     return write(options, output, force=force, as_json=as_json)

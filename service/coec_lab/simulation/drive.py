@@ -26,6 +26,7 @@ from coec_lab.simulation import simulated_sensors
 from coec_lab.simulation.faults import Fault, shifted
 from coec_lab.simulation.journey import START_NS, Journey
 from coec_lab.simulation.lidar_model import LIDARS, LidarModel
+from coec_lab.simulation.reflectance import INTENSITIES
 from coec_lab.simulation.render import LensProperties
 from coec_lab.simulation.scene import Solid
 from coec_lab.simulation.vehicle_motion import T_ego_lidar, body, workshop_T_camera_lidar
@@ -74,6 +75,8 @@ class DriveConfig:
             camera.
         half_view_deg: the lens sees this far off its axis: 92.5 for 185°.
         lidar: a name in `LIDARS`, or any model.
+        intensity: a name in `reflectance.INTENSITIES`, for a LiDAR that writes another kind than its model; None: its
+            own.
         camera_hz, lidar_hz, ego_hz: frames per second; a sweep always lasts one period of its model.
         camera_delay_s: the camera exposes this long after the stamp of its sweep.
         speed_mps: mean speed, 0 for a standing vehicle; None = as usual in the scene.
@@ -94,6 +97,7 @@ class DriveConfig:
     camera: str | Camera = "fisheye700"
     half_view_deg: float = 92.5
     lidar: str | LidarModel = "64"
+    intensity: str | None = None
     camera_hz: float = 10.0
     lidar_hz: float = 10.0
     ego_hz: float = 50.0
@@ -143,7 +147,7 @@ class SimulatedDrive:
         self._turning = simulated_sensors.SimulatedLidar(
             self._journey,
             simulated_sensors.Wire("lidar", config.lidar_hz, _LIDAR, faults=config.faults),
-            lidar_of(config.lidar),
+            lidar_of(config.lidar, config.intensity),
             lambda _: T_ego_lidar(),
         )  # fmt: skip
         self._mount()
@@ -302,13 +306,16 @@ def needed(plan: list[Arrival], cameras: Collection[int], camera: int, lidar: in
             yield entry
 
 
-def lidar_of(choice: str | LidarModel) -> LidarModel:
-    """The model of a name. Raises UsageError, which lists the known names."""
-    if isinstance(choice, LidarModel):
-        return choice
-    if choice not in LIDARS:
+def lidar_of(choice: str | LidarModel, intensity: str | None = None) -> LidarModel:
+    """The model of a name, with a kind of intensity. Raises UsageError, which lists the known names."""
+    if isinstance(choice, str) and choice not in LIDARS:
         raise UsageError(f"there is no LiDAR {choice!r}; choose one of {', '.join(LIDARS)}")
-    return LIDARS[choice]
+    model = LIDARS[choice] if isinstance(choice, str) else choice
+    if intensity is None:
+        return model
+    if intensity not in INTENSITIES:
+        raise UsageError(f"there is no intensity {intensity!r}; choose one of {', '.join(INTENSITIES)}")
+    return replace(model, intensity=INTENSITIES[intensity])
 
 
 def camera_of(choice: str | Camera, half_view_deg: float) -> Camera:

@@ -16,7 +16,10 @@ Colour = tuple[float, float, float]
 
 
 class Material(IntEnum):
-    """Kind of surface: decides its texture (`shading`) and how it reflects a laser (`lidar`)."""
+    """Kind of surface: decides its texture (`shading`) and how it reflects a laser (`reflectance`).
+
+    RETRO is prismatic sheeting, which SIGN is not; BEADED is MARKING with glass beads; LIT is a lamp of a vehicle.
+    """
 
     PAINT = 0
     ASPHALT = 1
@@ -35,6 +38,10 @@ class Material(IntEnum):
     CONCRETE = 14
     CLOTH = 15
     LAMP = 16
+    RETRO = 17
+    BEADED = 18
+    LIT = 19
+    STEEL = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)

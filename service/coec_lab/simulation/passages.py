@@ -82,6 +82,9 @@ def passages(faults: tuple[Fault, ...], pace: Pace, seconds: float) -> Passages:
 
 Doubles = NDArray[np.float64]
 
+LAMP_HEAD_M = 0.15
+"""Height of the head of a street lamp."""
+
 
 class Site:
     """Gathers the meshes of a stretch at places along the road. `left_m` counts from the centre line.
@@ -89,6 +92,7 @@ class Site:
     Attributes:
         origin_m: (3,) world position that is the origin of the meshes.
         meshes: what was put there so far.
+        lamps_m: (3,) each, street lamps that were put there, relative to `origin_m`.
     """
 
     def __init__(self, road: Road, begin_m: float, empty: tuple[RoadSpan, ...] = ()) -> None:
@@ -97,6 +101,7 @@ class Site:
         self.begin_m = begin_m
         self.origin_m = road.points(begin_m, 0.0, 0.0)
         self.meshes: list[Mesh] = []
+        self.lamps_m: list[Doubles] = []
         self._empty = empty
 
     def put(self, mesh: Mesh, s_m: float, left_m: float, turn_rad: float = 0.0, up_m: float = 0.0) -> None:
@@ -107,6 +112,16 @@ class Site:
         x, y, z = self.road.points(self.begin_m + s_m, left_m, up_m) - self.origin_m
         heading = float(self.road.at(self.begin_m + s_m)[3])
         self.meshes.append(mesh.placed(float(x), float(y), float(z), heading + turn_rad))
+
+    def put_lamp(self, mesh: Mesh, s_m: float, left_m: float, turn_rad: float, up_m: float) -> None:
+        """Puts a street lamp, whose head is its highest part, as `put` does."""
+        before = len(self.meshes)
+        self.put(mesh, s_m, left_m, turn_rad, up_m)
+        for placed in self.meshes[before:]:
+            corners = placed.corners_m.reshape(-1, 3).astype(np.float64)
+            top = corners[:, 2].max()
+            head = corners[corners[:, 2] > top - LAMP_HEAD_M].mean(axis=0)
+            self.lamps_m.append(np.array([head[0], head[1], top - LAMP_HEAD_M]))
 
     def strip(self, s_m: Doubles, left_m: tuple[float, float], up_m: tuple[float, float]) -> Floats:
         """(Q, 4, 3) quads that follow the road between the given arc lengths, counted from `begin_m`."""
@@ -129,6 +144,13 @@ WALL, CEILING = (0.42, 0.45, 0.46), (0.20, 0.20, 0.20)
 PORTAL, TURF = (0.30, 0.31, 0.31), (0.09, 0.22, 0.16)
 SPINE_M = 1.0
 """Spacing of a spine."""
+CLAD_M, CLAD_COLOURS = 3.0, ((0.60, 0.62, 0.62), (0.52, 0.54, 0.55))
+"""Height of the panels on the walls, and their colours."""
+PANEL_M, JOINT_M = 4.0, 0.05
+"""Length of a panel, and the width of the joint between two."""
+WALKWAY_M, WALKWAY_HIGH_M = 0.5, 0.2
+EXITS_M = 24.0
+"""Spacing of the signs that show the way out, and of niches with doors, by turns on either side."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,9 +199,43 @@ def dig(site: Site, span: RoadSpan, part: RoadSpan, lane_m: float) -> None:
         wall = site.strip(s, (side * half, side * half), (-0.3, HIGH_M))
         slope = site.strip(s, (side * HILL_FLAT_M, side * HILL_FOOT_M), (top, -0.3))
         site.meshes += [quads(wall, WALL, Material.PAINT), quads(slope, TURF, Material.GRASS)]
+        _line(site, part, side, half)
     for mouth_m in (span.begin_m, span.end_m):
         if mouth_m in (part.begin_m, part.end_m):
             _face(site, mouth_m, half, top)
+
+
+def _line(site: Site, part: RoadSpan, side: float, half_m: float) -> None:
+    """Panels with joints, a walkway, a cable tray, doors and signs along one wall of a part of a tunnel."""
+
+    def sheet(begin_m: float, end_m: float, in_m: float, low_m: float, high_m: float) -> Floats:
+        """(1, 4, 3) on the wall, so far in front of it, between two places along the road."""
+        left = side * (half_m - in_m)
+        return site.strip(np.array([begin_m, end_m]) - site.begin_m, (left, left), (low_m, high_m))
+
+    first, last = (math.ceil(part.begin_m / PANEL_M), math.floor(part.end_m / PANEL_M))
+    for number in range(first, last):
+        begin, end = number * PANEL_M, (number + 1) * PANEL_M
+        colour = CLAD_COLOURS[number % 7 == 3]
+        site.meshes += [
+            quads(sheet(begin, end, 0.02, WALKWAY_HIGH_M, CLAD_M), colour, Material.PAINT),
+            quads(sheet(begin, begin + JOINT_M, 0.025, WALKWAY_HIGH_M, CLAD_M), (0.08, 0.08, 0.08), Material.RUBBER),
+            quads(sheet(begin, end, 0.03, CLAD_M, CLAD_M + 0.08), (0.10, 0.12, 0.14), Material.PAINT),
+            quads(sheet(begin, end, 0.25, HIGH_M - 0.5, HIGH_M - 0.4), (0.45, 0.46, 0.46), Material.STEEL),
+            quads(sheet(begin, end, WALKWAY_M, -0.1, WALKWAY_HIGH_M), (0.4, 0.41, 0.41), Material.CONCRETE),
+        ]
+        top = site.strip(
+            np.array([begin, end]) - site.begin_m, (side * half_m, side * (half_m - WALKWAY_M)), (WALKWAY_HIGH_M,) * 2
+        )
+        site.meshes.append(quads(top, (0.4, 0.41, 0.41), Material.CONCRETE))
+        if number * PANEL_M % EXITS_M == (0.0 if side > 0 else EXITS_M / 2):
+            middle = begin + PANEL_M / 2
+            green = quads(sheet(middle - 0.45, middle + 0.45, 0.05, 2.3, 2.8), (0.10, 0.45, 0.05), Material.LIT)
+            arrow = quads(sheet(middle - 0.25, middle + 0.15, 0.06, 2.48, 2.62), (0.9, 0.9, 0.9), Material.LIT)
+            door = quads(sheet(middle + 0.6, middle + 1.6, 0.04, 0.2, 2.25), (0.08, 0.30, 0.08), Material.PAINT)
+            box_of_hose = quads(sheet(middle - 1.5, middle - 0.7, 0.04, 0.8, 1.6), (0.05, 0.05, 0.5), Material.PAINT)
+            reflector = quads(sheet(begin + 0.1, begin + 0.25, 0.06, 0.8, 0.95), (0.8, 0.8, 0.8), Material.RETRO)
+            site.meshes += [green, arrow, door, box_of_hose, reflector]
 
 
 def _face(site: Site, at_m: float, half_m: float, top_m: float) -> None:

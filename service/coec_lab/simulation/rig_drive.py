@@ -28,17 +28,19 @@ from coec.geometry.cameras import Camera
 from coec.geometry.se3 import inverse, perturb, rotation_exp
 from coec.io.recordings.recording_source import SensorMessage
 from coec_lab.simulation import simulated_sensors
-from coec_lab.simulation.drive import Arrival, arrivals, camera_of, check_rates, needed, seconds_of, stamps_of
+from coec_lab.simulation.drive import Arrival, arrivals, camera_of, check_rates, lidar_of, needed, seconds_of, stamps_of
 from coec_lab.simulation.faults import Fault, SensorFault, shifted
 from coec_lab.simulation.journey import Journey
 from coec_lab.simulation.lidar_model import LIDARS, LidarModel, Turn, even_deg
+from coec_lab.simulation.reflectance import INTENSITIES
 from coec_lab.simulation.render import LensProperties
 from coec_lab.simulation.scene import Solid
 from coec_lab.simulation.vehicle_motion import whole_body
 
 NEAR = LidarModel(
-    Turn(even_deg(-52.0, 52.0, 32), columns=900), reach_m=30.0, nearest_m=0.3, noise_m=0.02, divergence_rad=0.003
-)
+    Turn(even_deg(-52.0, 52.0, 32), columns=900), reach_m=30.0, nearest_m=0.3, noise_m=0.02, divergence_rad=0.003,
+    intensity=INTENSITIES["reflectivity"],
+)  # fmt: skip
 """A short-range LiDAR that sees nearly a hemisphere, with angles and reach of common blind-spot sensors."""
 
 
@@ -150,6 +152,7 @@ class RigDriveConfig:
         faults: of single sensors or of all; a step or drift turns a sensor about its own axes: T_sensor_ego becomes
             exp(ξ)·T_sensor_ego.
         workshop: by sensor, (6,) ξ, degrees and metres about its own axes, by which its nominal pose is wrong.
+        intensity: of every LiDAR, see `drive.DriveConfig`.
         rows: of every camera, see `Optics`: comparing edges with a LiDAR needs only the rows that the LiDAR sees.
     """
 
@@ -158,6 +161,7 @@ class RigDriveConfig:
     scene: str = "street"
     seconds: float = 60.0
     camera: str = "fisheye700"
+    intensity: str | None = None
     camera_hz: float = 10.0
     lidar_hz: float = 10.0
     ego_hz: float = 50.0
@@ -218,7 +222,8 @@ class RigDrive:
         }
         for lidar in layout.lidars:
             self._streams[lidar.name] = simulated_sensors.SimulatedLidar(
-                self._journey, self._wire(lidar.name, config.lidar_hz), lidar.model, self._mount(lidar.name),
+                self._journey, self._wire(lidar.name, config.lidar_hz), lidar_of(lidar.model, config.intensity),
+                self._mount(lidar.name),
                 delay_s=lidar.phase / config.lidar_hz, own_body=self._body,
             )  # fmt: skip
         for camera in layout.cameras:

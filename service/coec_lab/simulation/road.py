@@ -77,6 +77,8 @@ FAR_GAPS_M = (62.0, 118.0, -48.0)
 """The same on a highway: two seconds and a half apart."""
 HIGHWAY_MPS, HIGHWAY_GAP_M = 27.0, 130.0
 """Speed and spacing of the oncoming traffic on a highway."""
+FAST_MPS, FAST_GAP_M = 34.0, 80.0
+"""The same of those that overtake."""
 WALKERS, WALK_M, WALK_S = 3, 1.8, 7.0
 """People in a room: how many, how far they go to and fro, and how long that takes."""
 
@@ -105,10 +107,19 @@ def in_street(seed: int, at_m: float, time_s: float, own: Progress, lane_m: floa
     yield from _coming(seed, at_m, time_s, left, ONCOMING_MPS, ONCOMING_GAP_M)
 
 
-def on_highway(seed: int, at_m: float, time_s: float, own: Progress, own_left_m: float) -> Iterator[Mover]:
-    """Few cars, far apart, in the vehicle's lane and beyond the median."""
+def on_highway(
+    seed: int, at_m: float, time_s: float, own: Progress, own_left_m: float, fast_left_m: float
+) -> Iterator[Mover]:
+    """Few vehicles, far apart, in the vehicle's lane and beyond the median; faster ones in the lane to its left."""
     yield from _ahead(seed, own, FAR_GAPS_M, own_left_m)
     yield from _coming(seed, at_m, time_s, -own_left_m, HIGHWAY_MPS, HIGHWAY_GAP_M)
+    middle = int(np.floor((at_m - FAST_MPS * time_s) / FAST_GAP_M))
+    for number in range(middle - 1, middle + 2):
+        rng = np.random.default_rng([seed, 109, number + 2**20])
+        if rng.random() < 0.7:
+            start = number * FAST_GAP_M + rng.uniform(0, FAST_GAP_M - 25)
+            model = int(rng.integers(MODELS))
+            yield Mover(model, _against(float(start), -FAST_MPS), fast_left_m, oncoming=False)
 
 
 def in_room(seed: int, own: Progress, half_m: float) -> Iterator[Mover]:

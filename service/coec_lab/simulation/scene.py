@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from coec.geometry.compiler import njit
 from coec_lab.simulation.mesh import Floats, Mesh, join
 from coec_lab.simulation.passages import Bore, Passages
+from coec_lab.simulation.reflectance import infrared
 from coec_lab.simulation.road import MODELS, Mover, Progress, Road, build_road
 from coec_lab.simulation.street import NO_PASSAGES, STRETCH_M, Stretch, backdrop
 from coec_lab.simulation.surroundings import Street, Surroundings
@@ -22,6 +23,7 @@ BEHIND, AHEAD = 3, 4
 RAYS_AT_ONCE = 1 << 18
 """Rays per call of Embree, which bounds the memory for an image of any size."""
 MISSED = -1
+NO_LAMPS = np.empty((0, 3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,28 +78,33 @@ class Scene:
     Attributes:
         origin_m: (3,) world position that is the origin of its meshes.
         street: everything that stands still, without the models of cars.
-        colour, material: (T, 3) float32 and (T,) int8 of all triangles: the street, then each model of car.
+        colour, material, infrared: (T, 3) float32, (T,) int8 and (T,) float32 (see `reflectance.infrared`) of all
+            triangles: the street, then each model of car.
         sky: light and weather.
         movers: moving cars near the place, at the instant for which the scene was requested.
-        headlights: (L, 4, 3) of the vehicle, see `lamps.headlights`; none by day.
+        headlights: (L, 4, 3) of the vehicle, see `shading.headlights`; none by day.
+        lamps_m: (K, 3) street lamps, world; they shine when the headlights do.
         bores: the tunnels of the road.
     """
 
     def __init__(
-        self, road: Road, sky: Sky, origin_m: Doubles, street: Mesh, models: list[Solid], bores: tuple[Bore, ...] = ()
-    ) -> None:
+        self, road: Road, sky: Sky, origin_m: Doubles, street: Mesh, models: list[Solid], bores: tuple[Bore, ...] = (),
+        lamps_m: Doubles = NO_LAMPS,
+    ) -> None:  # fmt: skip
         self.road = road
         self.sky = sky
         self.origin_m = origin_m
         self.movers: tuple[Mover, ...] = ()
         self.headlights: Doubles = np.empty((0, 4, 3))
         self.bores = bores
+        self.lamps_m = lamps_m
         self.street = street
         self._solid = Solid(street)
         self._models = models
         self._first = np.cumsum([len(street.colour)] + [len(model.mesh.colour) for model in models])
         self.colour = np.concatenate([street.colour, *(model.mesh.colour for model in models)])
         self.material = np.concatenate([street.material, *(model.mesh.material for model in models)])
+        self.infrared = infrared(self.colour, self.material)
 
     def cast(self, origins_m: Doubles, directions: Floats, time_s: ArrayLike, reach_m: float = 400.0) -> Hits:
         """The first surface along each ray.
@@ -218,7 +225,8 @@ class Town:
             parts.append(Mesh(stretch.mesh.corners_m + shift, stretch.mesh.colour, stretch.mesh.material))
         lowest = min(float(mesh.corners_m[:, :, 2].min()) for mesh in parts)
         street = join([*parts, backdrop().placed(0, 0, min(lowest, 0.0), 0)])
-        return Scene(self.road, self.sky, origin, street, self._models, self._bores)
+        lamps_m = np.concatenate([stretch.lamps_m + stretch.origin_m for stretch in stretches.values()])
+        return Scene(self.road, self.sky, origin, street, self._models, self._bores, lamps_m)
 
     def _on_cleared(self, mover: Mover, time_s: float) -> bool:
         place_m = float(mover.progress(np.array([time_s]))[0])

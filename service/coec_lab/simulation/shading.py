@@ -1,8 +1,4 @@
-"""Light on surfaces: sun, sky, headlights and lamps, textures of the materials, shadows.
-
-Textures are sums of value noise (Perlin, "An image synthesizer", SIGGRAPH 1985, with hashed lattice values) at places
-in the world. Each octave fades out before a pixel covers its wavelength, so that unresolved detail does not flicker.
-"""
+"""Light on surfaces: sun, sky, headlights and lamps, shadows."""
 
 import math
 from dataclasses import replace
@@ -13,9 +9,10 @@ from numpy.typing import NDArray
 
 from coec.calibration.types import Matrix4
 from coec.geometry.compiler import PRANGE, njit, prange
-from coec_lab.simulation.mesh import Floats
+from coec_lab.simulation.mesh import Floats, Material
 from coec_lab.simulation.passages import SPINE_M
 from coec_lab.simulation.scene import Hits, Scene
+from coec_lab.simulation.textures import FOLIAGE, GLASS, LACQUER, LAMP, LIT, SALTS, hashed, noise, texture
 from coec_lab.simulation.weather import Sky
 
 Doubles = NDArray[np.float64]
@@ -33,6 +30,16 @@ BEAM_LIGHT_M2, BEAM_SPILL = 12.0, 0.02
 """A dipped beam: light on its axis times the square of the distance, and the share that goes everywhere ahead."""
 BEAM_DOWN_RAD, BEAM_WIDE_RAD, BEAM_HIGH_RAD, BEAM_CUT_RAD = 0.02, 0.45, 0.14, 0.015
 """How far its axis points below the horizon; its width to the sides, below and above the axis, to 1/e of the light."""
+LAMP_LIGHT_M2, LAMP_REACH_M, LAMP_GLOW_M, LAMP_GLOW = 2.0, 25.0, 0.7, 1.5
+"""A street lamp: light straight below it times the square of the distance, how far it reaches; within how far its own
+head glows, and its light there."""
+HEADLIGHT_GAIN = np.ones(len(Material), np.float32)
+"""Share of the light of the vehicle's own headlights that comes back to its camera, relative to a matt surface."""
+HEADLIGHT_GAIN[[Material.RETRO, Material.BEADED]] = 40.0, 5.0
+LIT_RADIANCE = 0.3
+"""Radiance of a vehicle's lamp of white colour."""
+WINDOW_LIGHT, WINDOWS_LIT = (0.04, 0.08, 0.12), 0.2
+"""Radiance of a window with light behind it, and the share of such windows at night."""
 NIGHT = 0.002
 """Light of the sky at night over a town, as a share of daylight; a camera sees no colour in it."""
 
@@ -52,7 +59,10 @@ def incident(scene: Scene, origin_m: Doubles, directions: Floats, hits: Hits) ->
         _in_bore(origin, directions, hits.range_m, hits.normal, room.spine, room.half_m,
                  room.high_m, room.light, share, lamps)  # fmt: skip
     if len(scene.headlights):
-        _headlit(origin, directions, hits.range_m, hits.normal, scene.headlights, lamps)
+        gain = np.where(hits.triangle < 0, np.float32(1.0), HEADLIGHT_GAIN[scene.material[hits.triangle]])
+        _headlit(origin, directions, hits.range_m, hits.normal, scene.headlights, gain, lamps)
+        if len(scene.lamps_m):
+            _lamplit(origin, directions, hits.range_m, hits.normal, scene.lamps_m, lamps)
     return Incident(share, lamps)
 
 
@@ -111,7 +121,7 @@ def _in_bore(
 
 @njit(cache=True, parallel=PRANGE)
 def _headlit(
-    origin: Doubles, directions: Floats, range_m: Floats, normal: Floats, beams: Doubles, lamps: Floats
+    origin: Doubles, directions: Floats, range_m: Floats, normal: Floats, beams: Doubles, gain: Floats, lamps: Floats
 ) -> None:
     for i in prange(len(directions)):
         r = float(range_m[i])
@@ -134,19 +144,40 @@ def _headlit(
             over = math.atan2(up, math.sqrt(ahead * ahead + left * left)) + BEAM_DOWN_RAD
             over /= BEAM_CUT_RAD if over > 0.0 else BEAM_HIGH_RAD
             beam = math.exp(-across * across - over * over) + BEAM_SPILL
-            lamps[i] += BEAM_LIGHT_M2 * beam * facing / squared
+            lamps[i] += gain[i] * BEAM_LIGHT_M2 * beam * facing / squared
 
 
-# The numbers of `Material`, as constants of the compiled code.
-ASPHALT, PAVING, GRASS, BRICK, PLASTER, GLASS, LACQUER, FOLIAGE, BARK, TILES, MARKING = range(1, 12)
-RUBBER, CONCRETE = 13, 14
-LAMP = 16
+@njit(cache=True, parallel=PRANGE)
+def _lamplit(
+    origin: Doubles, directions: Floats, range_m: Floats, normal: Floats, lamps_m: Doubles, lamps: Floats
+) -> None:
+    for i in prange(len(directions)):
+        r = float(range_m[i])
+        if not r < 1e6:
+            continue
+        px, py, pz = (
+            origin[0] + r * directions[i, 0],
+            origin[1] + r * directions[i, 1],
+            origin[2] + r * directions[i, 2],
+        )
+        for k in range(len(lamps_m)):
+            x, y = lamps_m[k, 0] - px, lamps_m[k, 1] - py
+            flat = x * x + y * y
+            if flat > LAMP_REACH_M * LAMP_REACH_M:
+                continue
+            z = lamps_m[k, 2] - pz
+            squared = flat + z * z
+            if squared < LAMP_GLOW_M * LAMP_GLOW_M:
+                lamps[i] += LAMP_GLOW
+                continue
+            away = math.sqrt(squared)
+            facing = (x * normal[i, 0] + y * normal[i, 1] + z * normal[i, 2]) / away
+            if facing > 0.0 and z > 0.0:
+                lamps[i] += LAMP_LIGHT_M2 * (z / away) * facing / squared
+
 
 DAY_HORIZON = 0.5
 """By day the horizon is brighter than this (`sky.draw_sky`); where it is darker, the skyline is darker, too."""
-SALTS = np.arange(64)
-"""Numbers that make one noise differ from another. They are in an array because the compiler compiles a function anew
-for every literal number with which it is called, but not for every entry of an array."""
 LAMP_RADIANCE = 2.0
 """Radiance of a visible lamp: white, twice a wall in full sun."""
 
@@ -177,87 +208,6 @@ def _light(sky: Sky) -> Doubles:
     return np.array([sky.towards_sun, sky.sun, sky.zenith, sky.horizon], np.float64)
 
 
-@njit(cache=True, inline="always")
-def _hash(i: np.int64, j: np.int64, salt: int) -> float:
-    """A hash from 0 to 1 for an integer cell."""
-    h = (np.uint32(i) * np.uint32(0x8DA6B343)) ^ (np.uint32(j) * np.uint32(0xD8163841)) ^ np.uint32(salt)
-    h = np.uint32((h ^ (h >> np.uint32(15))) * np.uint32(0x2C1B3C6D))
-    h = np.uint32((h ^ (h >> np.uint32(12))) * np.uint32(0x297A2D39))
-    return float((h ^ (h >> np.uint32(15))) >> np.uint32(8)) * (1.0 / 16777216.0)
-
-
-@njit(cache=True)
-def _noise(u: float, v: float, salt: int) -> float:
-    """Value noise, 0 to 1, of wavelength 1."""
-    fu, fv = math.floor(u), math.floor(v)
-    i, j = np.int64(fu), np.int64(fv)
-    a, b = u - fu, v - fv
-    a = a * a * (3.0 - 2.0 * a)
-    b = b * b * (3.0 - 2.0 * b)
-    low = _hash(i, j, salt) * (1 - a) + _hash(i + np.int64(1), j, salt) * a
-    high = _hash(i, j + np.int64(1), salt) * (1 - a) + _hash(i + np.int64(1), j + np.int64(1), salt) * a
-    return low * (1 - b) + high * b
-
-
-@njit(cache=True)
-def _octave(u: float, v: float, wave_m: float, footprint_m: float, salt: int) -> float:
-    """Noise about 0 (-0.5 to 0.5) of one wavelength, faded where it cannot be resolved."""
-    fade = 1.5 - 2.0 * footprint_m / wave_m
-    if fade <= 0.0:
-        return 0.0
-    return min(fade, 1.0) * (_noise(u / wave_m, v / wave_m, salt) - 0.5)
-
-
-@njit(cache=True)
-def _line(u: float, period_m: float, width_m: float, footprint_m: float) -> float:
-    """Share of a pixel that lies in lines of this width that repeat along u, 0 to 1."""
-    place = abs(u - period_m * math.floor(u / period_m) - 0.5 * period_m)
-    place = 0.5 * period_m - place  # distance to the nearest line
-    wide = 0.5 * max(width_m, footprint_m)
-    cover = 0.0 if place > wide + 0.5 * footprint_m else min(1.0, width_m / (2.0 * wide))
-    blend = min(1.0, footprint_m / (0.5 * period_m))
-    return cover * (1 - blend) + blend * width_m / period_m
-
-
-@njit(cache=True)
-def _texture(kind: int, u: float, v: float, foot: float) -> float:
-    """Factor on the colour of a surface at its coordinates u, v (m; v is the height on walls)."""
-    if kind == ASPHALT:
-        return (1.0 + 0.5 * _octave(u, v, 0.04, foot, SALTS[1]) + 0.3 * _octave(u, v, 0.25, foot, SALTS[2])
-                + 0.3 * _octave(u, v, 2.5, foot, SALTS[3]) + 0.2 * _octave(u, v, 11.0, foot, SALTS[4]))  # fmt: skip
-    if kind == PAVING:
-        joint = max(_line(u, 0.5, 0.02, foot), _line(v, 0.5, 0.02, foot))
-        slab = _hash(np.int64(math.floor(u / 0.5)), np.int64(math.floor(v / 0.5)), 5) - 0.5
-        fade = max(0.0, min(1.0, 1.5 - 2 * foot / 0.5))
-        return (1.0 - 0.5 * joint) * (1.0 + 0.22 * fade * slab + 0.3 * _octave(u, v, 0.1, foot, SALTS[6])
-                                      + 0.25 * _octave(u, v, 3.0, foot, SALTS[7]))  # fmt: skip
-    if kind == GRASS:
-        return (1.0 + 0.8 * _octave(u, v, 0.07, foot, SALTS[8]) + 0.6 * _octave(u, v, 0.4, foot, SALTS[9])
-                + 0.5 * _octave(u, v, 2.0, foot, SALTS[10]) + 0.4 * _octave(u, v, 9.0, foot, SALTS[11]))  # fmt: skip
-    if kind == BRICK:
-        row = math.floor(v / 0.08)
-        shifted = u + 0.12 * (row - 2 * math.floor(row / 2))
-        joint = max(_line(v, 0.08, 0.012, foot), _line(shifted, 0.24, 0.012, foot))
-        brick = _hash(np.int64(math.floor(shifted / 0.24)), np.int64(row), 12) - 0.5
-        fade = max(0.0, min(1.0, 1.5 - 2 * foot / 0.1))
-        return (1.0 + 0.35 * joint) * (1.0 + 0.5 * fade * brick + 0.3 * _octave(u, v, 1.7, foot, SALTS[13]))
-    if kind in (PLASTER, CONCRETE):
-        return (1.0 + 0.15 * _octave(u, v, 0.05, foot, SALTS[14]) + 0.12 * _octave(u, v, 0.6, foot, SALTS[15])
-                + 0.22 * _octave(u, 0.4 * v, 2.4, foot, SALTS[16]))  # fmt: skip
-    if kind == FOLIAGE:
-        return 1.0 + 0.9 * _octave(u, v, 0.12, foot, SALTS[17]) + 0.7 * _octave(u, v, 0.5, foot, SALTS[18])
-    if kind == BARK:
-        return 1.0 + 0.8 * _octave(4 * u, v, 0.2, foot, SALTS[19])
-    if kind == TILES:
-        return (1.0 - 0.45 * max(_line(v, 0.3, 0.04, foot), 0.6 * _line(u, 0.22, 0.03, foot))) * (
-            1.0 + 0.3 * _octave(u, v, 0.3, foot, SALTS[20]) + 0.3 * _octave(u, v, 2.0, foot, SALTS[21])
-        )
-    if kind == MARKING:
-        worn = _octave(u, v, 0.3, foot, SALTS[22]) + _octave(u, v, 0.05, foot, SALTS[23])
-        return 1.0 + 0.35 * worn
-    return 1.0 + 0.08 * _octave(u, v, 0.6, foot, SALTS[24])
-
-
 @njit(cache=True)
 def _sky(x: float, y: float, z: float, light: Doubles, clouds: float, clear: bool, colour: Doubles) -> None:
     """Radiance of the sky in a direction, into `colour`: with a far skyline, and the sun if `clear`."""
@@ -268,8 +218,8 @@ def _sky(x: float, y: float, z: float, light: Doubles, clouds: float, clear: boo
     cloud = 0.0
     if clouds > 0.0 and z > 0.02:
         u, v = x / (z + 0.12), y / (z + 0.12)
-        amount = (0.5 * _noise(1.3 * u, 1.3 * v, SALTS[31]) + 0.3 * _noise(3.1 * u, 3.1 * v, SALTS[32])
-                  + 0.2 * _noise(7.7 * u, 7.7 * v, SALTS[33]))  # fmt: skip
+        amount = (0.5 * noise(1.3 * u, 1.3 * v, SALTS[31]) + 0.3 * noise(3.1 * u, 3.1 * v, SALTS[32])
+                  + 0.2 * noise(7.7 * u, 7.7 * v, SALTS[33]))  # fmt: skip
         cloud = min(max((amount - (0.75 - 0.5 * clouds)) * 5.0, 0.0), 1.0)
     for c in range(3):
         value = light[3, c] * (1 - blend) + light[2, c] * blend
@@ -279,7 +229,7 @@ def _sky(x: float, y: float, z: float, light: Doubles, clouds: float, clear: boo
         if clear and towards > 0.99996 and cloud < 0.5:
             colour[c] += 30.0 * light[1, c]
     far = math.atan2(y, x)
-    line = 0.012 + 0.05 * _noise(9.0 * far, 0.5, SALTS[34]) + 0.012 * _noise(70.0 * far, 0.5, SALTS[35])
+    line = 0.012 + 0.05 * noise(9.0 * far, 0.5, SALTS[34]) + 0.012 * noise(70.0 * far, 0.5, SALTS[35])
     if z < line:
         dark = min(max((line - z) / 0.004, 0.0), 1.0) * 0.55
         lit = min(light[3, 1] / DAY_HORIZON, 1.0)
@@ -311,7 +261,7 @@ def _reflect(
     if rz > 0.25 or (kind == LACQUER and rz > 0.02):
         _sky(rx, ry, rz, light, clouds, False, mirrored)
     else:  # what stands opposite, a blotch
-        shade_of = 0.10 + 0.25 * _noise(0.35 * u + 3 * rx, 0.35 * v + 3 * rz, SALTS[40])
+        shade_of = 0.10 + 0.25 * noise(0.35 * u + 3 * rx, 0.35 * v + 3 * rz, SALTS[40])
         for c in range(3):
             mirrored[c] = shade_of * (light[3, c] + 0.3 * light[1, c])
     for c in range(3):
@@ -320,6 +270,21 @@ def _reflect(
     spot = 6.0 * max(glint, 0.0) ** 400 * (1.0 - shadowed) if glint > 0.9 else 0.0
     for c in range(3):
         colour[c] = colour[c] * (1 - shiny) + shiny * mirrored[c] + spot * light[1, c]
+
+
+@njit(cache=True)
+def _emit(kind: int, paint: Floats, colour: Doubles) -> None:
+    """Adds to `colour` the light of lamps, and of windows with light behind them."""
+    if kind == LAMP:
+        for c in range(3):
+            colour[c] = LAMP_RADIANCE
+    elif kind == LIT:
+        for c in range(3):
+            colour[c] += LIT_RADIANCE * paint[c]
+    # Each pane has a tone of its own, which says whether there is light behind it.
+    elif hashed(np.int64(paint[0] * 1e5), np.int64(paint[2] * 1e5), SALTS[41]) < WINDOWS_LIT:
+        for c in range(3):
+            colour[c] += WINDOW_LIGHT[c]
 
 
 @njit(cache=True, parallel=PRANGE)
@@ -340,6 +305,7 @@ def _shade(
     pixel_rad: float,
     out: Floats,
 ) -> None:
+    dark = light[3, 1] < 5.0 * NIGHT
     for i in prange(len(directions)):
         dx, dy, dz = float(directions[i, 0]), float(directions[i, 1]), float(directions[i, 2])
         colour = np.empty(3)
@@ -361,7 +327,7 @@ def _shade(
             u, v = (ny * x - nx * y) / flat, z
         kind = material[t]
         shiny = _shininess(kind, facing)
-        factor = 1.0 if kind in (GLASS, LACQUER) else _texture(kind, u, v, foot)
+        factor = 1.0 if kind in (GLASS, LACQUER) else texture(kind, u, v, foot)
         sunny = max(nx * light[0, 0] + ny * light[0, 1] + nz * light[0, 2], 0.0)
         if kind == FOLIAGE:
             sunny = 0.35 + 0.5 * sunny  # leaves face all directions and let light through
@@ -375,9 +341,8 @@ def _shade(
             colour[c] = paint[t, c] * factor * (light[1, c] * sunny + ambient * sky_share[i] + lamps[i])
         if shiny > 0.0:
             _reflect(kind, shiny, dx, dy, dz, nx, ny, nz, u, v, light, clouds, sky_share[i], shadowed[i], colour)
-        if kind == LAMP:
-            for c in range(3):
-                colour[c] = LAMP_RADIANCE
+        if kind in (LAMP, LIT) or (kind == GLASS and dark and abs(nz) < 0.05):
+            _emit(kind, paint[t], colour)
         air = math.exp(-r / haze_m)
         for c in range(3):  # the air shines with the light that falls into it
             out[i, c] = colour[c] * air + (1 - air) * light[3, c] * 0.95 * sky_share[i]

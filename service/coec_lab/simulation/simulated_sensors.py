@@ -18,6 +18,7 @@ from coec_lab.simulation.faults import Fault, late_s
 from coec_lab.simulation.journey import Journey
 from coec_lab.simulation.lidar_model import LidarModel, Sweep, sweep
 from coec_lab.simulation.mesh import Floats
+from coec_lab.simulation.reflectance import beam_gains
 from coec_lab.simulation.scene import Solid
 from coec_lab.simulation.shading import around
 from coec_lab.simulation.weather import CLEAR, SHOWER_S, rained_lens, rainy_air
@@ -34,7 +35,7 @@ BODY = np.float32(0.05)
 """Share of the horizon's light that the black body of the vehicle reflects."""
 NEAREST_M = 1.0
 """Range whose inverse has the largest depth code, 65535."""
-_LOSS, _EXPOSURE, _BEAMS, _SWEEP = 130, 131, 132, 133
+_LOSS, _EXPOSURE, _BEAMS, _SWEEP, _GAINS = 130, 131, 132, 133, 137
 """Keys of random numbers, by purpose."""
 
 
@@ -136,6 +137,9 @@ class SimulatedLidar:
         self._delay_s = delay_s
         self._own_body = own_body
         self._repeated: tuple[int, LidarFrame] | None = None
+        self._gains: Doubles | None = None
+        if model.intensity is not None:
+            self._gains = beam_gains(model.intensity, model.pattern.beams, journey.rng(_GAINS, *wire.key))
 
     def time_s(self, index: int) -> float:
         """See `Aboard`."""
@@ -171,7 +175,7 @@ class SimulatedLidar:
             return np.asarray(np.einsum("nij,jk->nik", journey.trip.poses(times_s), mounted), np.float64)
 
         noise = journey.rng(_SWEEP, *key, index)
-        measured = sweep(journey.scene(time_s), self._model, poses, time_s, noise, dead, air)
+        measured = sweep(journey.scene(time_s), self._model, poses, time_s, noise, dead, air, self._gains)
         if self._own_body is not None:
             measured = _past(self._own_body, mounted, measured)
         return LidarFrame(
@@ -187,7 +191,8 @@ def _past(own_body: Solid, T_ego_lidar: Matrix4, measured: Sweep) -> Sweep:
     origins[:] = T_ego_lidar[:3, 3]
     free = ~own_body.blocked(origins, rays)
     ring = None if measured.ring is None else measured.ring[free]
-    return Sweep(measured.xyz_m[free], measured.intensity[free], ring, measured.time_offset_s[free])
+    intensity = None if measured.intensity is None else measured.intensity[free]
+    return Sweep(measured.xyz_m[free], intensity, ring, measured.time_offset_s[free])
 
 
 @dataclass(frozen=True, slots=True)

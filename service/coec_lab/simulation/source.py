@@ -31,7 +31,7 @@ NUMBERS: dict[str, tuple[float, float]] = {
 }
 """Query keys with a number, and its least and greatest value. The defaults are those of `DriveConfig`."""
 WHOLE = ("seed",)
-NAMES = ("scene", "camera", "lidar")
+NAMES = ("scene", "camera", "lidar", "intensity")
 """Query keys with a name; `DriveConfig` says which names exist."""
 SWITCHES = ("depth", "traffic")
 TEXT_KEYS = (*NAMES, *SWITCHES, "faults", "workshop", "intrinsics_off")
@@ -88,7 +88,7 @@ def require_embree() -> None:
 
 RIG_KEYS = (
     *("seed", "seconds", "camera_hz", "lidar_hz", "ego_hz", "start_m", "speed_mps"),
-    *("rig", "pair", "scene", "camera", "depth", "traffic", "faults", "workshop"),
+    *("rig", "pair", "scene", "camera", "intensity", "depth", "traffic", "faults", "workshop"),
 )
 """Query keys of a rig; numbers have the limits of `NUMBERS`."""
 

@@ -297,10 +297,12 @@ def sample_style(seed: int) -> Style:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stretch:
-    """One stretch; its mesh is relative to `origin_m` (3,), so that float32 stays exact far along the road."""
+    """One stretch; its mesh and `lamps_m` (L, 3), its street lamps, are relative to `origin_m` (3,), so that float32
+    stays exact far along the road."""
 
     origin_m: Doubles
     mesh: Mesh
+    lamps_m: Doubles
 
 
 def build_stretch(seed: int, index: int, road: Road, style: Style, passages: Passages = NO_PASSAGES) -> Stretch:
@@ -318,7 +320,7 @@ def build_stretch(seed: int, index: int, road: Road, style: Style, passages: Pas
     for span in passages.tunnels:
         if part := span.part(begin_m, end_m):
             dig(site, span, part, style.lane_m)
-    return Stretch(site.origin_m, join(site.meshes))
+    return Stretch(site.origin_m, join(site.meshes), np.array(site.lamps_m).reshape(-1, 3))
 
 
 def backdrop() -> Mesh:
@@ -466,7 +468,7 @@ def _furniture(rng: np.random.Generator, site: Site, style: Style, side: float, 
     walk = half + KERB_WIDTH_M
     turn = 0.0 if side < 0 else np.pi
     for at in np.arange(begin_m + rng.uniform(1, 12), STRETCH_M, rng.uniform(18, 30)):
-        site.put(props.lamp(rng), float(at), side * (walk + 0.35), turn, KERB_M)
+        site.put_lamp(props.lamp(rng), float(at), side * (walk + 0.35), turn, KERB_M)
     if rng.random() < style.trees:
         for at in np.arange(begin_m + rng.uniform(3, 9), STRETCH_M - 1, rng.uniform(7, 14)):
             site.put(props.broadleaf(rng), float(at), side * (walk + 0.55), 0.0, KERB_M)

@@ -56,6 +56,8 @@ reflectance."""
 DROPS_PER_MMPH = 6e-4
 """Share of the rays that a drop reflects, per millimetre of rain an hour: 1.5 % at 25 mm/h, the order that published
 rain chambers show for automotive sensors."""
+WET_MMPH = 5.0
+"""Rain that wets a road all over."""
 LENS_DROPS_PER_MMPH, LENS_DROP_SHARE = 2.0, (0.008, 0.03)
 """Drops on the lens per millimetre an hour, and their radius as a share of the width of the picture."""
 SHOWER_S = 4.0
@@ -73,10 +75,12 @@ class Air:
     Attributes:
         extinction_per_m: share of the light that is lost per metre, one way.
         drops: share of the rays that a drop reflects.
+        wetness: of the road, 0 dry to 1.
     """
 
     extinction_per_m: float = 0.0
     drops: float = 0.0
+    wetness: float = 0.0
 
 
 CLEAR = Air()
@@ -85,7 +89,8 @@ CLEAR = Air()
 def rainy_air(mm_per_h: float) -> Air:
     """Air in rain: 1.076 R^0.67 dB/km (Carbonneau and Wisely 1998, for free-space optics)."""
     decibel_per_km = 1.076 * mm_per_h**0.67
-    return Air(math.log(10.0) / 10.0 * decibel_per_km / 1000.0, DROPS_PER_MMPH * mm_per_h)
+    wetness = min(mm_per_h / WET_MMPH, 1.0)
+    return Air(math.log(10.0) / 10.0 * decibel_per_km / 1000.0, DROPS_PER_MMPH * mm_per_h, wetness)
 
 
 def rainy_sky(sky: Sky, mm_per_h: float) -> Sky:

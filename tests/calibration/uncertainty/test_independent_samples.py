@@ -25,7 +25,7 @@ from coec.io.images import GreyImages
 from support.simulated_drives import rendered_source
 
 FRAMES = 10
-MOTORWAY = "sim:seed=3&seconds=12&camera_hz=0.5&lidar_hz=0.5&scene=highway&camera=pinhole640x400&lidar=64"
+MOTORWAY = "sim:seed=7&seconds=12&camera_hz=0.5&lidar_hz=0.5&scene=highway&camera=pinhole640x400&lidar=64"
 
 
 def selected(edges: EdgeFrames, frames: list[int]) -> EdgeFrames:

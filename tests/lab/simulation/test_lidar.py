@@ -109,9 +109,10 @@ def test_a_sign_answers_brighter_than_asphalt() -> None:
         walls = a_room()
         painted = Mesh(walls.corners_m, walls.colour, np.full_like(walls.material, int(material)))
         detected = sweep(a_scene(painted), EXACT, moving(0.0), 0.0, np.random.default_rng(0))
+        assert detected.intensity is not None
         return float(np.median(detected.intensity))
 
-    assert strength(Material.SIGN) > 3 * strength(Material.ASPHALT)
+    assert strength(Material.SIGN) > 2 * strength(Material.ASPHALT)
 
 
 @pytest.mark.parametrize("name", ["raster", "rosette"])

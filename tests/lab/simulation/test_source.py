@@ -17,6 +17,7 @@ from coec_lab.simulation import source
         ("sim:seconds=0", "seconds=0"),
         ("sim:camera=box", "fisheye700"),
         ("sim:lidar=63", "choose one of 64, 32, 16, 128, raster, rosette"),
+        ("sim:intensity=loud", "choose one of calibrated, reflectivity, raw, coarse, none"),
         ("sim:workshop=1,2", "rx,ry,rz"),
         ("sim:depth=maybe", "yes or no"),
         ("sim:faults=rust:3", "unknown fault"),
