@@ -244,8 +244,8 @@ class Fusion:
         a normal tail falls with the square). With a plain sum, two weak results could outdo one that cannot be chance.
         """
         stacked = np.array(poses).reshape(-1, 4, 4)
-        witnesses = zip(*self.contrasts_by_kind(stacked), self.depth_contrasts(stacked), strict=True)
-        return [hypot(*(max(contrast, 0.0) for contrast in of_pose)) for of_pose in witnesses]
+        contrasts = zip(*self.contrasts_by_kind(stacked), self.depth_contrasts(stacked), strict=True)
+        return [hypot(*(max(contrast, 0.0) for contrast in of_pose)) for of_pose in contrasts]
 
     def rank(self, T_camera_lidar: Matrix4) -> float:
         """The same for one pose (4, 4)."""
