@@ -136,11 +136,12 @@ def test_one_value_everywhere_teaches_no_noise_and_values_that_are_not_finite_ma
 def test_steps_are_those_of_a_slow_reading_of_the_definition() -> None:
     rng = np.random.default_rng(8)
     xyz_m, ring, _ = wall(0.4)
-    kept = np.flatnonzero(rng.random(len(xyz_m)) < 0.8)
-    xyz_m, ring = xyz_m[kept] * rng.uniform(0.99, 1.01, (len(kept), 1)).astype(np.float32), ring[kept]
+    retained = np.flatnonzero(rng.random(len(xyz_m)) < 0.8)
+    xyz_m, ring = xyz_m[retained] * rng.uniform(0.99, 1.01, (len(retained), 1)).astype(np.float32), ring[retained]
     lines = scan_lines(xyz_m, ring)
     values = (
-        rng.integers(0, 9, len(kept)) // 8 + 4 * rng.integers(0, 5, len(kept) // 4 + 1).repeat(4)[: len(kept)]
+        rng.integers(0, 9, len(retained)) // 8
+        + 4 * rng.integers(0, 5, len(retained) // 4 + 1).repeat(4)[: len(retained)]
     ).astype(np.float32)
     height, highest = _slow(lines.azimuth, lines.range_m, lines.first, values[lines.order])
     steps: ReflectanceSteps = reflectance_steps(lines, values)
