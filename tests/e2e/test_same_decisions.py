@@ -20,7 +20,7 @@ from coec.config import (
     WindowConfig,
     load_config,
 )
-from coec.io.mcap.bag_writer import write_bag
+from coec.io.mcap.writer import write_bag
 from coec.io.zenoh.player import Frame
 from coec.service.decision_log import differences, read_log
 from coec.service.drive_replay import DriveReplay

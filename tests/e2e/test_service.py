@@ -17,7 +17,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from coec.cli import play
 from coec.config import CalibrationConfig, DepthConfig, ObjectiveConfig, WindowConfig
-from coec.io.mcap.window_reader import read_result, read_window
+from coec.io.mcap.windows import read_result, read_window
 from coec.io.recordings.layouts import open_source
 from coec.io.zenoh.player import Frame
 from e2e.drives import NS_PER_S, SHORT, SHORT_PAIRS, Drive, later, rendered

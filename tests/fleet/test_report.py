@@ -12,7 +12,7 @@ import pytest
 from coec.errors import UsageError
 from coec.fleet import tables
 from coec.fleet.report import report
-from coec.io.mcap.window_reader import read_result
+from coec.io.mcap.windows import read_result
 from coec.reports import fleet_page
 from coec.reports.page import VerdictBanner, render
 from coec.reports.page_parts import Provenance

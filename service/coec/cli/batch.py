@@ -117,12 +117,12 @@ def _engine(
     name: str, jobs: int | None, bounds: WorkerLimits, ray_address: str | None, *, send_credentials: bool
 ) -> Engine:
     if name == "ray":
-        from coec.fleet.ray_engine import RayEngine
+        from coec.fleet.engines import RayEngine
 
         return RayEngine(jobs, bounds, ray_address, send_credentials=send_credentials)
     if ray_address is not None:
         raise UsageError("--ray-address is for --engine ray")
-    from coec.fleet.local_engine import LocalEngine
+    from coec.fleet.engines import LocalEngine
 
     return LocalEngine(jobs or len(os.sched_getaffinity(0)), bounds)
 

@@ -46,7 +46,8 @@ def calibrate(
     """Calibrate from a recording: exit 0 if the result is accepted, 1 if the self-diagnosis refuses it."""
     from coec.config import WindowConfig
     from coec.io import user_files as files
-    from coec.io.recordings import manifest_correction, window_cutting
+    from coec.io.recordings import window_cutting
+    from coec.io.recordings.manifest import has_manifest, manifest_of
     from coec.recording import perturbation_of
     from coec.reports import calibration, console
     from coec.reports.console import StageTimes
@@ -55,7 +56,7 @@ def calibrate(
         files.try_folder(output)
     if options.get("perturb") is not None:
         perturbation_of(options["perturb"] or ())
-    manifest = manifest_correction.manifest_of(source) if fix else None
+    manifest = manifest_of(source) if fix else None
     with console.progress() as bars:
         times = StageTimes(bars)
         loaded = window_cutting.load_window(
@@ -79,7 +80,7 @@ def calibrate(
         _show(solution, document, intrinsics=intrinsics)
     if manifest is not None and solution.mistake is not None:
         show_correction(manifest, solution.mistake, loaded.window.rig)
-    elif solution.mistake is not None and solution.mistake.correctable and manifest_correction.has_manifest(source):
+    elif solution.mistake is not None and solution.mistake.correctable and has_manifest(source):
         console.say("coec: the same command with --fix writes a corrected dataset.yaml")
     if not_written is not None:
         console.say(f"coec: {not_written}")

@@ -39,7 +39,7 @@ def check(
     """Show the content of a recording and predict the verdict: exit 1 if a calibration is impossible or refused."""
     from coec.calibration.monitor.check_verdict import MIN_PAIRS
     from coec.io.recordings.layouts import open_source
-    from coec.io.recordings.manifest_correction import manifest_of
+    from coec.io.recordings.manifest import manifest_of
     from coec.reports import console
     from coec.reports.console import StageTimes
     from coec.reports.formatting import count

@@ -181,7 +181,7 @@ def _configuration(recording: RecordingSource, out: Path, *, full: bool, force: 
 
 def _bag(recording: RecordingSource, out: Path) -> list[Path]:
     from coec.calibration.types import CameraFrame
-    from coec.io.mcap.bag_writer import write_bag
+    from coec.io.mcap.writer import write_bag
     from coec.reports import console
 
     depth = any(isinstance(frame, CameraFrame) and frame.depth is not None for frame in first_frames(recording))

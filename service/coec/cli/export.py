@@ -110,7 +110,7 @@ def _read(source: Path, config: Path | None, pair: str | None, frames: ExportFra
 
 def _of_window(path: Path, frames: ExportFrames) -> ExportedExtrinsic:
     from coec.io.exported_extrinsic import extrinsic_of_result
-    from coec.io.mcap.window_reader import read_result, read_window
+    from coec.io.mcap.windows import read_result, read_window
     from coec.io.rig_files import intrinsics_config
 
     result = read_result(path)

@@ -24,7 +24,7 @@ from coec.errors import CoecError, DecodeError, NotFoundError, OutputError, Remo
 if TYPE_CHECKING:
     import zenoh
 
-    from coec.io.zenoh.window_fetch import RecordingInfo
+    from coec.io.zenoh.query_client import RecordingInfo
     from coec.schemas.documents import Absent, FetchedFile, FetchedWindow, IncidentReport
     from coec.schemas.keys import Keys
     from coec.schemas.message import Message
@@ -326,7 +326,7 @@ class Download:
             self.absent.append(Absent(what=f"{len(near) - MAX_SNIPPETS} snippets", why=f"{why}; {how}"))
 
     def _recording(self, recording_id: str) -> RecordingInfo | None:
-        from coec.io.zenoh.window_fetch import fetch_window
+        from coec.io.zenoh.query_client import fetch_window
         from coec.reports import console
         from coec.schemas.documents import Absent, FetchedFile
 
@@ -434,7 +434,7 @@ def _around(key: str, event: EvidenceEvent) -> str:
 
 
 def _in_history(path: Path, window_id: str, history: HistoryReply | None) -> bool | None:
-    from coec.io.mcap.window_reader import read_result
+    from coec.io.mcap.windows import read_result
     from coec.schemas.message import SCHEMA_VERSION
 
     entries = () if history is None else history.entries

@@ -180,7 +180,7 @@ def show_correction(manifest: Path, mistake: Mistake, rig: Rig) -> None:
     Raises:
         OutputError: it cannot be written.
     """
-    from coec.io.recordings.manifest_correction import write_corrected
+    from coec.io.recordings.manifest import write_corrected
     from coec.reports import console
 
     correction = write_corrected(manifest, mistake, rig.camera, rig.T_camera_lidar_nominal)

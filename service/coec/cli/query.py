@@ -455,8 +455,7 @@ def _save_picture(request: Request, way: RouterAddress, keys: Keys, path: Path, 
 def _download(
     request: Request, way: RouterAddress, keys: Keys, window_id: str, output: Path | None, *, force: bool, as_json: bool
 ) -> int:
-    from coec.io.zenoh.query_client import connected_by, single_key
-    from coec.io.zenoh.window_fetch import fetch_window
+    from coec.io.zenoh.query_client import connected_by, fetch_window, single_key
     from coec.reports import console
 
     if output is None:

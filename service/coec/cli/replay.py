@@ -92,7 +92,7 @@ def replay(
 def _is_window(path: Path, *, alone: bool) -> bool:
     """Whether this is the file of a window, with or without a result. A damaged file counts as one if it is given
     `alone`, without an option that applies to drives."""
-    from coec.io.mcap.window_reader import is_window
+    from coec.io.mcap.windows import is_window
 
     if path.suffix != ".mcap" or not path.is_file():
         return False
@@ -107,7 +107,7 @@ def _replay_window(window: Path, depth: str | None, *, as_json: bool) -> int:
     from coec.config import LimitsConfig
     from coec.io.depth.depth_maps import open_depth
     from coec.io.images import GreyImages
-    from coec.io.mcap.window_reader import read_result, read_window
+    from coec.io.mcap.windows import read_result, read_window
     from coec.io.serialise import comparable, result_of
     from coec.reports import console
     from coec.reports.console import StageTimes
@@ -223,7 +223,7 @@ def _show_drive(
     if log is not None:
         write_log(log, replayed.decisions)
     if report is not None:
-        from coec.service.replay_page import write_replay_page
+        from coec.service.drive_replay import write_replay_page
 
         write_replay_page(report, recording.name, replayed, first_ns, None if against is None else differing)
     if as_json:
@@ -270,7 +270,7 @@ def _table(replayed: ReplayedDrive, first_ns: int) -> None:
     """Prints what was decided, without the checks that changed nothing."""
     from coec.reports import console
     from coec.reports.formatting import count
-    from coec.service.replay_page import outline
+    from coec.service.drive_replay import outline
 
     checks = [one for one in replayed.decisions if one.kind == "check"]
     windows = [one for one in replayed.decisions if one.kind == "estimate"]

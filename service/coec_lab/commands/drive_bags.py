@@ -13,7 +13,7 @@ from coec.calibration.types import CameraFrame
 from coec.errors import OutputError, UsageError
 from coec.geometry.cameras import intrinsics_of, name_of
 from coec.geometry.se3 import inverse
-from coec.io.mcap.bag_writer import write_bag, write_messages
+from coec.io.mcap.writer import write_bag, write_messages
 from coec.io.rig_files import mask_to_png
 from coec.io.ros import message_encoding, messages
 from coec.io.ros.message_encoding import PlacedFrame

@@ -13,7 +13,7 @@ import pytest
 from pydantic import BaseModel
 
 from coec.config import StateConfig
-from coec.io.mcap.window_writer import RecordedWindow
+from coec.io.mcap.windows import RecordedWindow
 from coec.io.zenoh.bus import Answer
 from coec.schemas.keys import Format
 from coec.schemas.message import from_msgpack

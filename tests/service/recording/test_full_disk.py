@@ -16,7 +16,7 @@ from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFo
 from coec.config import CalibrationConfig, StateConfig
 from coec.geometry.cameras import build
 from coec.io.logs import LossCounter
-from coec.io.mcap.window_reader import read_window
+from coec.io.mcap.windows import read_window
 from coec.service.recording.recorder import Recorder, RecordingPlan, RecordingThread, WindowLost, WindowRecorded
 from coec.service.recording.window_store import WindowStore
 from support.disk import FullDisk

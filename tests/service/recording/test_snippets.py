@@ -18,7 +18,7 @@ from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFo
 from coec.errors import NotFoundError, UsageError
 from coec.geometry.cameras import build
 from coec.io.logs import LossCounter
-from coec.io.mcap.bag_writer import SnippetFile
+from coec.io.mcap.writer import SnippetFile
 from coec.io.recordings.bag import open_bag
 from coec.io.recordings.recording_source import parse_spec
 from coec.service.ingest.decoder import Frame

@@ -14,11 +14,10 @@ from coec.calibration.frames.lidar_origin import NO_SCAN_LINES, ApparentOrigin, 
 from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Recognition, Rig
 from coec.config import CalibrationConfig
 from coec.errors import DecodeError, SourceError, UsageError
-from coec.io.mcap.window_reader import is_window, read_window
+from coec.io.mcap.windows import is_window, read_window
 from coec.io.recordings import bag_index, bag_recognition, recording_source
 from coec.io.recordings.bag_folder import open_storage
-from coec.io.recordings.bag_recognition import Sweep
-from coec.io.recordings.bag_rig import PairMessages, lidar_frame_of, rig_of_bag
+from coec.io.recordings.bag_recognition import PairMessages, Sweep, lidar_frame_of, rig_of_bag
 from coec.io.recordings.bag_storage import BagReader, BagStorage
 from coec.io.recordings.cloud_files import measured_from
 from coec.io.recordings.recording_source import evenly_spread

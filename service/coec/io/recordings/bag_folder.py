@@ -22,10 +22,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from coec.config import describe, load_yaml
 from coec.errors import ConfigError, SourceError
 from coec.io.mcap.reader import MAX_RATIO, MAX_ZSTD_WINDOW
-from coec.io.mcap.window_reader import is_window
-from coec.io.recordings.bag_storage import BagMessage, BagReader, BagStorage, McapStorage, SqliteStorage
+from coec.io.mcap.windows import is_window
+from coec.io.recordings.bag_storage import BagMessage, BagReader, BagStorage, McapStorage, Ros1Storage, SqliteStorage
 from coec.io.recordings.recording_source import BAG_SUFFIXES
-from coec.io.recordings.ros1_bag import Ros1Storage
 
 
 def open_storage(path: Path) -> BagStorage:

@@ -23,7 +23,7 @@ from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, 
 from coec.config import LimitsConfig, PointTimeConfig, describe
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.io.recordings.bag_storage import MAX_MESSAGE_BYTES, BagMessage, BagReader, BagStorage
-from coec.io.ros import camera_info, livox, message_decoding, messages
+from coec.io.ros import camera_info, message_decoding, messages, point_clouds
 from coec.io.ros.transforms import (
     MovingFrame,
     StaticTransform,
@@ -78,7 +78,7 @@ class CloudDecoder:
 
 
 IMAGE_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE)
-CLOUD_TYPES = (messages.POINT_CLOUD, *livox.TYPES)
+CLOUD_TYPES = (messages.POINT_CLOUD, *point_clouds.TYPES)
 VELOCITY_TYPES = (messages.ODOMETRY, messages.TWIST, messages.TWIST_WITH_COVARIANCE)
 ROTATION_TYPES = (messages.IMU,)
 
@@ -155,7 +155,7 @@ class BagIndex:
                 f"; {other} has {type_name}: {message_decoding.REFUSED[type_name]}"
                 for other, type_name in self.unread.items()
             )
-            named = " or ".join(name for name in types if name not in livox.TYPES)
+            named = " or ".join(name for name in types if name not in point_clouds.TYPES)
             raise SourceError(f"{self.path} has no message of type {named}{advice}")
         return topic
 

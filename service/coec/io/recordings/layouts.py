@@ -40,7 +40,7 @@ def open_source(spec: str) -> RecordingSource:
     # Each layout is imported when it is asked for, because not all need OpenCV, rosbags and the MCAP readers.
     match parsed.layout:
         case "kitti360":
-            from coec.io.recordings.kitti360 import open_kitti360
+            from coec.io.recordings.kitti import open_kitti360
 
             return open_kitti360(parsed)
         case "kitti-raw":
@@ -48,7 +48,7 @@ def open_source(spec: str) -> RecordingSource:
 
             return open_kitti_raw(parsed)
         case "kitti-odometry":
-            from coec.io.recordings.kitti_odometry import open_kitti_odometry
+            from coec.io.recordings.kitti import open_kitti_odometry
 
             return open_kitti_odometry(parsed)
         case "sim":
@@ -64,7 +64,7 @@ def _open_path(spec: SourceSpec) -> RecordingSource:
         from coec.io.recordings.bag import open_bag
 
         return open_bag(spec)
-    from coec.io.recordings.kitti_odometry import is_kitti_odometry, open_kitti_odometry
+    from coec.io.recordings.kitti import is_kitti_odometry, open_kitti_odometry
 
     if is_kitti_odometry(spec.path) and not (spec.path / "dataset.yaml").is_file():
         return open_kitti_odometry(spec)

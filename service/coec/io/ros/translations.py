@@ -20,7 +20,7 @@ from rosbags.typesys.stores import ros2_humble as ros
 
 from coec.errors import DecodeError
 from coec.io.frame_validation import Refusal
-from coec.io.ros import livox, messages
+from coec.io.ros import messages, point_clouds
 
 MAX_JSON_BYTES: Final = 64 * 2**20
 """Largest message in JSON: an image of 32 MiB has 43 MiB in base64."""
@@ -69,7 +69,7 @@ def _ros_1() -> dict[tuple[str, str], Translation]:
 
 
 _LIVOX: Final = Translation(
-    messages.POINT_CLOUD, lambda data: messages.serialized(livox.cloud_of_ros_1(data), messages.POINT_CLOUD)
+    messages.POINT_CLOUD, lambda data: messages.serialized(point_clouds.cloud_of_ros_1(data), messages.POINT_CLOUD)
 )
 
 

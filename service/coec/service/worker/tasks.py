@@ -42,8 +42,8 @@ from coec.io.msgpack_frames import decode_camera
 from coec.io.nearest_neighbours import Trees, installed
 from coec.io.rig_files import rig_of
 from coec.reports.close_ups import Caption, close_ups
+from coec.reports.drawing import render_points, titled
 from coec.reports.formatting import instant
-from coec.reports.overlay import render_points, titled
 from coec.service.worker import worker_jobs
 from coec.service.worker.warm_up import invented_window, warm_up_check, warm_up_solve
 from coec.service.worker.worker_jobs import (
@@ -172,8 +172,8 @@ class Solver:
         Raises:
             WindowError, CalibrationError, DecodeError, ModelError: there is no result.
         """
-        from coec.io.mcap.window_reader import read_window
-        from coec.io.mcap.window_writer import write_result
+        from coec.io.mcap.windows import read_window
+        from coec.io.mcap.windows import write_result
         from coec.io.serialise import result_of
 
         window, configuration = read_window(path)
@@ -229,7 +229,7 @@ class Solver:
         Raises:
             WindowError, DecodeError: the window or its image cannot be read.
         """
-        from coec.io.mcap.window_reader import read_window
+        from coec.io.mcap.windows import read_window
 
         window, configuration = read_window(path)
         return self._render(window.rig, configuration, pose, window.pairs[-1], title)
@@ -240,7 +240,7 @@ class Solver:
         Raises:
             WindowError, DecodeError, CalibrationError: the window or an image of it cannot be used.
         """
-        from coec.io.mcap.window_reader import read_window
+        from coec.io.mcap.windows import read_window
 
         window, configuration = read_window(path)
         before, after = (np.array(pose, dtype=np.float64) for pose in poses)
@@ -319,7 +319,7 @@ class Solver:
 
     @staticmethod
     def _windows_of(paths: Sequence[Path], T_camera_lidar_start: Matrix4) -> Steps[list[Window]]:
-        from coec.io.mcap.window_reader import read_window
+        from coec.io.mcap.windows import read_window
 
         windows = []
         for number, path in enumerate(paths, start=1):
