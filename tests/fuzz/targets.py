@@ -45,8 +45,7 @@ from coec.io.depth.model_cards import CARDS, read_card
 from coec.io.images import Inspector, decode_bgr, decode_depth, encode_depth_png, encode_png
 from coec.io.logs import LossCounter
 from coec.io.mcap.reader import McapMessage, read_records
-from coec.io.mcap.windows import is_window, read_result, read_window
-from coec.io.mcap.windows import salvage
+from coec.io.mcap.windows import is_window, read_result, read_window, salvage
 from coec.io.mcap.writer import PART_SUFFIX, salvage_snippet
 from coec.io.msgpack_frames import decode_camera, decode_ego, decode_lidar
 from coec.io.recordings.cloud_files import load_cloud

@@ -14,6 +14,9 @@ import typer
 
 from coec.cli.options import Json
 from coec.errors import UsageError
+from coec.reports import console
+from coec.reports.console import PlainColumn
+from coec.reports.formatting import count
 
 if TYPE_CHECKING:
     from coec.fleet.worker_pool import Engine, WorkerLimits
@@ -91,7 +94,6 @@ def batch(
     from coec.fleet.evaluator import load_settings
     from coec.fleet.jobs import jobs_of
     from coec.fleet.worker_pool import WorkerLimits
-    from coec.reports import console
 
     terms = load_settings(with_config, rig, depth)
     inputs = jobs_of(windows)
@@ -132,10 +134,6 @@ def _progress(total: int) -> Iterator[Callable[[WindowRow], None]]:
     """A function to call with every row; it shows a bar with rate and remaining time, or prints a line now and then."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
-    from coec.reports import console
-    from coec.reports.console import PlainColumn
-    from coec.reports.formatting import count
-
     bars = Progress(
         PlainColumn("windows"),
         BarColumn(),
@@ -166,9 +164,6 @@ def _progress(total: int) -> Iterator[Callable[[WindowRow], None]]:
 
 
 def _show(report: BatchReport, cores: int) -> None:
-    from coec.reports import console
-    from coec.reports.formatting import count
-
     rows = console.table("windows", "", right=(1,))
     rows.add_row("in all", str(report.windows))
     if report.kept:

@@ -12,6 +12,8 @@ import typer
 from coec.calibration_options import CalibrationOptions
 from coec.cli.options import Fix, Json, Source, show_correction, with_calibration_options
 from coec.errors import LensError, OutputError
+from coec.reports import console
+from coec.reports.console import StageTimes
 
 if TYPE_CHECKING:
     from coec.geometry.cameras import Camera
@@ -49,8 +51,7 @@ def calibrate(
     from coec.io.recordings import window_cutting
     from coec.io.recordings.manifest import has_manifest, manifest_of
     from coec.recording import perturbation_of
-    from coec.reports import calibration, console
-    from coec.reports.console import StageTimes
+    from coec.reports import calibration
 
     if output is not None:
         files.try_folder(output)

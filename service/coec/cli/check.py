@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Any
 from coec.calibration_options import SolverOptions, configuration_of
 from coec.cli.options import Depth, Fix, Json, Source, show_correction
 from coec.errors import CalibrationError, SourceError
+from coec.reports import console
+from coec.reports.console import StageTimes
+from coec.reports.formatting import count
 
 if TYPE_CHECKING:
     from coec.calibration.types import Estimate, Mistake
@@ -40,9 +43,6 @@ def check(
     from coec.calibration.monitor.check_verdict import MIN_PAIRS
     from coec.io.recordings.layouts import open_source
     from coec.io.recordings.manifest import manifest_of
-    from coec.reports import console
-    from coec.reports.console import StageTimes
-    from coec.reports.formatting import count
     from coec.reports.recording_fitness import fitness_of
 
     manifest = manifest_of(source) if fix else None
@@ -168,7 +168,6 @@ def _document(
 
 def _show(name: str, seen: Fitness, trial: Estimate | CalibrationError | None) -> None:
     from coec.calibration.types import Estimate
-    from coec.reports import console
 
     console.show(f"{name}: {seen.seconds:.1f} s")
     streams = console.table("stream", "frames", "Hz", "longest gap", "what", right=(1, 2, 3))
@@ -198,8 +197,6 @@ def _show(name: str, seen: Fitness, trial: Estimate | CalibrationError | None) -
 
 def _show_trial(trial: Estimate) -> None:
     from coec.io.serialise import degrees_or_null
-    from coec.reports import console
-    from coec.reports.formatting import count
 
     axes = console.table("axis", "from the recording's own", "± σ", "unit", right=(1, 2))
     correction, sigma = degrees_or_null(trial.correction), degrees_or_null(trial.sigma)
@@ -213,7 +210,6 @@ def _show_trial(trial: Estimate) -> None:
 
 def _show_topics(source: str) -> None:
     from coec.io.recordings.recording_source import is_bag, parse_spec
-    from coec.reports import console
 
     spec = parse_spec(source)
     if not is_bag(spec):

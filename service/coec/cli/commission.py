@@ -12,6 +12,9 @@ import typer
 from coec.calibration_options import SolverOptions, configuration_of
 from coec.cli.options import SOURCE_HELP, Depth, Dof, Frames, Json, Objective
 from coec.errors import UsageError
+from coec.reports import console
+from coec.reports.console import StageTimes
+from coec.reports.formatting import count
 
 if TYPE_CHECKING:
     from coec.calibration.baseline import Baseline
@@ -60,9 +63,8 @@ def commission(
     from coec.calibration.commissioning import commission as learn
     from coec.io.baseline_file import load_baselines, save_baseline
     from coec.io.user_files import try_file
-    from coec.reports import console, page
+    from coec.reports import page
     from coec.reports.baseline_page import baselines_page
-    from coec.reports.console import StageTimes
     from coec.reports.page_parts import Provenance
 
     serials = _serials_of(sensors or ())
@@ -165,8 +167,6 @@ def document_of(baseline: Baseline) -> dict[str, Any]:
 def show(baseline: Baseline) -> None:
     """Prints the baseline for people."""
     from coec.io.baseline_file import baseline_hash
-    from coec.reports import console
-    from coec.reports.formatting import count
 
     console.show(
         f"{baseline.pair}: commissioned from {count(baseline.pairs, 'pair')} of "
@@ -178,7 +178,6 @@ def show(baseline: Baseline) -> None:
 def show_learned(baseline: Baseline) -> None:
     """Prints bias, limits, and what the limits detect, as tables."""
     from coec.io.serialise import in_degrees
-    from coec.reports import console
 
     table = console.table("axis", "bias", "± σ", "σ of a check at 6 pairs", "unit", right=(1, 2, 3))
     bias, bias_sigma = in_degrees(baseline.pose.bias), in_degrees(baseline.pose.bias_sigma)
@@ -201,8 +200,6 @@ def show_learned(baseline: Baseline) -> None:
 
 def _show_limits(baseline: Baseline) -> None:
     import numpy as np
-
-    from coec.reports import console
 
     limits = console.table("limit of a check", "value", right=(1,))
     monitor = baseline.monitor

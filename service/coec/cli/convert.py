@@ -13,6 +13,7 @@ import typer
 
 from coec.cli.options import Force, Json, Source
 from coec.errors import OutputError, UsageError
+from coec.reports import console
 
 if TYPE_CHECKING:
     from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
@@ -61,7 +62,6 @@ def convert(
     """Turn a recording into a ROS 2 MCAP, or into a configuration with which `run` serves it."""
     from coec.io import user_files
     from coec.io.recordings.layouts import open_source
-    from coec.reports import console
 
     if out.suffix not in (".mcap", ".yaml", ".yml"):
         raise UsageError(f"{out}: OUT must end in .mcap (ROS 2 bag) or .yaml (daemon configuration)")
@@ -182,7 +182,6 @@ def _configuration(recording: RecordingSource, out: Path, *, full: bool, force: 
 def _bag(recording: RecordingSource, out: Path) -> list[Path]:
     from coec.calibration.types import CameraFrame
     from coec.io.mcap.writer import write_bag
-    from coec.reports import console
 
     depth = any(isinstance(frame, CameraFrame) and frame.depth is not None for frame in first_frames(recording))
     if depth:

@@ -11,6 +11,9 @@ import typer
 from coec.cli.commission import document_of, show_learned
 from coec.cli.options import Json
 from coec.errors import DecodeError, UsageError
+from coec.reports import console
+from coec.reports.console import figure
+from coec.reports.formatting import count
 
 if TYPE_CHECKING:
     from coec.calibration.baseline import Baseline
@@ -41,7 +44,7 @@ def report(
     """Report drift of every pair, what is refused and why, and what an earlier batch decided otherwise."""
     from coec.fleet import report as fleet_report
     from coec.io import user_files as files
-    from coec.reports import console, fleet_page, page
+    from coec.reports import fleet_page, page
     from coec.reports.page_parts import Provenance
     from coec.schemas.message import to_json
 
@@ -64,9 +67,7 @@ def report(
 
 
 def _show(summary: FleetReport) -> None:
-    from coec.reports import console, fleet_page
-    from coec.reports.console import figure
-    from coec.reports.formatting import count
+    from coec.reports import fleet_page
     from coec.schemas.fleet import AXES
 
     console.show(fleet_page.sentence(summary))
@@ -112,7 +113,6 @@ def _fleet_now(path: Path) -> FleetNow:
 
 def _show_sql(results: Path) -> None:
     from coec.fleet import tables
-    from coec.reports import console
 
     console.write(f"-- the view `{tables.WINDOWS_VIEW}` of the examples below\n")
     console.write(f"{tables.view_statement(tables.WINDOWS_VIEW, results)};\n\n")
@@ -138,7 +138,6 @@ def commission(
     """Learn from commissioned vehicles what others of their model start from (`state.model`): bias, spread, limits."""
     from coec.calibration.baseline import model_baseline
     from coec.io.baseline_file import load_baselines, save_baseline
-    from coec.reports import console
 
     vehicles = [load_baselines(path) for path in _each_once(baselines)]
     for path, pairs in zip(baselines, vehicles, strict=True):
@@ -167,9 +166,6 @@ def _each_once(paths: Sequence[Path]) -> Sequence[Path]:
 
 
 def _show_model(model: Baseline, vehicles: int) -> None:
-    from coec.reports import console
-    from coec.reports.formatting import count
-
     console.show(
         f"{model.pair}: {count(vehicles, 'vehicle')}, {count(model.pairs, 'pair')} of {count(model.windows, 'window')}"
     )

@@ -23,6 +23,7 @@ import typer
 
 from coec.calibration_options import Entry, entries
 from coec.errors import ExitCode, UsageError
+from coec.reports import console
 
 if TYPE_CHECKING:
     from coec.calibration.types import Mistake, Rig
@@ -181,7 +182,6 @@ def show_correction(manifest: Path, mistake: Mistake, rig: Rig) -> None:
         OutputError: it cannot be written.
     """
     from coec.io.recordings.manifest import write_corrected
-    from coec.reports import console
 
     correction = write_corrected(manifest, mistake, rig.camera, rig.T_camera_lidar_nominal)
     console.say(f"coec: written {correction.path}: {'; '.join(correction.changes)}")

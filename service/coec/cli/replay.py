@@ -11,6 +11,9 @@ import typer
 
 from coec.cli.options import Json, Source
 from coec.errors import SourceError, UsageError, WindowError
+from coec.reports import console
+from coec.reports.console import StageTimes
+from coec.reports.formatting import count
 
 if TYPE_CHECKING:
     from coec.config import Config
@@ -109,8 +112,6 @@ def _replay_window(window: Path, depth: str | None, *, as_json: bool) -> int:
     from coec.io.images import GreyImages
     from coec.io.mcap.windows import read_result, read_window
     from coec.io.serialise import comparable, result_of
-    from coec.reports import console
-    from coec.reports.console import StageTimes
     from coec.schemas.message import to_json
     from coec.service.decision_log import value_differences
 
@@ -178,7 +179,6 @@ def _opened(source: str, file: Path | None, name: str | None, depth: str | None)
 def _replay_drive(recording: RecordingSource, config: Config, begin_s: float, until_s: float | None) -> ReplayedDrive:
     from tempfile import TemporaryDirectory
 
-    from coec.reports import console
     from coec.service.drive_replay import DriveReplay
 
     if not recording.camera_stamps_ns:
@@ -211,7 +211,6 @@ def _show_drive(
     explain_s: float | None,
     as_json: bool,
 ) -> int:
-    from coec.reports import console
     from coec.service.decision_log import differences, read_log, write_log
 
     log, against, report = files
@@ -268,8 +267,6 @@ def _document(replayed: ReplayedDrive, differing: tuple[Difference, ...] | None)
 
 def _table(replayed: ReplayedDrive, first_ns: int) -> None:
     """Prints what was decided, without the checks that changed nothing."""
-    from coec.reports import console
-    from coec.reports.formatting import count
     from coec.service.drive_replay import outline
 
     checks = [one for one in replayed.decisions if one.kind == "check"]
@@ -288,9 +285,6 @@ def _table(replayed: ReplayedDrive, first_ns: int) -> None:
 
 
 def _show_differences(differing: tuple[Difference, ...], against: Path, first_ns: int) -> None:
-    from coec.reports import console
-    from coec.reports.formatting import count
-
     if not differing:
         console.show(f"equal to {against}", "bold green")
         return
@@ -310,8 +304,6 @@ def _show_differences(differing: tuple[Difference, ...], against: Path, first_ns
 
 def _explain(replayed: ReplayedDrive, first_ns: int, moment_s: float) -> None:
     """Prints the steps of the engine around a moment of the drive."""
-    from coec.reports import console
-
     table = console.table("s", "event", "actions", "health")
     for one in replayed.transitions:
         at_s = (one.stamp_ns - first_ns) / NS_PER_S

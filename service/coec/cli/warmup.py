@@ -11,6 +11,8 @@ import typer
 
 from coec.cli.options import Json
 from coec.errors import OutputError, UsageError
+from coec.reports import console
+from coec.reports.console import StageTimes
 
 if TYPE_CHECKING:
     from coec.config import OpenPairConfig, PairConfig
@@ -47,7 +49,6 @@ def warmup(
     again.
     """
     from coec.geometry.compiler import kernel_cache
-    from coec.reports import console
 
     models = _lens_models(config, lenses)
     folder, is_writable = kernel_cache()
@@ -93,8 +94,6 @@ def _compile(lenses: Sequence[str]) -> int:
     """Runs every kernel once; returns how many there are."""
     from coec.config import Config
     from coec.geometry import compilation_events
-    from coec.reports import console
-    from coec.reports.console import StageTimes
     from coec.service.worker.compilation import compiled
     from coec.service.worker.second_compiler import second_compiler
     from coec.service.worker.tasks import Solver

@@ -19,18 +19,7 @@ from coec.geometry import se3
 from coec.geometry.cameras import Camera
 from coec.geometry.edges.image_edges import Rectangle
 from coec.io.images import GreyImages, decode_bgr
-from coec.reports import drawing
-from coec.reports.difference_regions import (
-    DifferenceRegion,
-    DifferenceRegions,
-    Outlines,
-    Shift,
-    angles_deg,
-    difference_regions,
-    project_outlines,
-    shift_px,
-    spread_px,
-)
+from coec.reports import difference_regions, drawing
 from coec.reports.drawing import LABEL_PX, LINE_PX, TEXT_PX, Pixels
 from coec.reports.formatting import count, instant, number
 
@@ -119,7 +108,7 @@ def close_ups(
         DecodeError: an image cannot be decoded.
         CalibrationError: an image is not of the camera's size.
     """
-    shift = shift_px(window, T_before, T_after, compensated=compensated)
+    shift = difference_regions.shift_px(window, T_before, T_after, compensated=compensated)
     enlarged = (
         ENLARGED[0] if shift is None else min(max(SHOWN_PX / max(shift.median_px, SAME_PX), ENLARGED[0]), ENLARGED[1])
     )
@@ -127,7 +116,9 @@ def close_ups(
     size = (max(8, round(PANEL_PX[0] / enlarged)), max(8, round(PANEL_PX[1] / enlarged)))
     bounds = LimitsConfig() if limits is None else limits
     images = GreyImages(bounds)
-    telling = difference_regions(window, images, T_before, T_after, size, PLACES, compensated=compensated)
+    telling = difference_regions.difference_regions(
+        window, images, T_before, T_after, size, PLACES, compensated=compensated
+    )
     pair = window.pairs[telling.index]
     image = decode_bgr(pair.camera.image, bounds)
     width = 2 * (AXIS_PX + PANEL_PX[0]) + 3 * GAP_PX
@@ -152,15 +143,22 @@ def close_ups(
 
 
 def _titles(
-    letter: str, place: DifferenceRegion, outlines: Outlines, rig: Rig, T_after: Matrix4, caption: Caption
+    letter: str,
+    place: difference_regions.DifferenceRegion,
+    outlines: difference_regions.Outlines,
+    rig: Rig,
+    T_after: Matrix4,
+    caption: Caption,
 ) -> tuple[str, str]:
     """Above both pictures of a part: how far the first extrinsic puts its outlines from where the second does, and how
     well the second is known there, each in degrees, pixels and σ of the second; and the strength of the edges."""
     middle_px = np.array([place.part.left + 0.5 * place.part.width, place.part.top + 0.5 * place.part.height])
-    (deg_per_px,) = angles_deg(rig.camera, middle_px[None] - (0.5, 0.0), middle_px[None] + (0.5, 0.0))
+    (deg_per_px,) = difference_regions.angles_deg(
+        rig.camera, middle_px[None] - (0.5, 0.0), middle_px[None] + (0.5, 0.0)
+    )
     spread = np.nan
     if caption.covariance is not None:
-        spread = spread_px(outlines, rig, T_after, caption.covariance, place.part)
+        spread = difference_regions.spread_px(outlines, rig, T_after, caption.covariance, place.part)
 
     def size(px: float) -> str:
         return f"{number(px * deg_per_px, 2)}° = {px:.1f} px"
@@ -183,8 +181,8 @@ def difference_text(T_before: Matrix4, T_after: Matrix4) -> str:
 
 def sentences(
     window: Window,
-    telling: DifferenceRegions,
-    shift: Shift | None,
+    telling: difference_regions.DifferenceRegions,
+    shift: difference_regions.Shift | None,
     T_before: Matrix4,
     T_after: Matrix4,
     caption: Caption,
@@ -233,7 +231,9 @@ def _axes_text(difference: NDArray[np.float64], spread: NDArray[np.float64]) -> 
     return ", ".join(parts)
 
 
-def _overview(picture: Pixels, shown: Rectangle, image_bgr: Pixels, regions: Sequence[DifferenceRegion]) -> None:
+def _overview(
+    picture: Pixels, shown: Rectangle, image_bgr: Pixels, regions: Sequence[difference_regions.DifferenceRegion]
+) -> None:
     view = picture[shown.slices]
     smaller = shown.width < image_bgr.shape[1]
     view[:] = cv2.resize(
@@ -257,7 +257,7 @@ def _panel(
     panel: Pixels,
     image_bgr: Pixels,
     rig: Rig,
-    outlines: Outlines,
+    outlines: difference_regions.Outlines,
     T_camera_lidar: Matrix4,
     part: Rectangle,
     colour: drawing.Colour,
@@ -269,7 +269,7 @@ def _panel(
     stretched = (grey - darkest + margin) * (255.0 / (brightest - darkest + 2.0 * margin))
     enlarged = cv2.resize(stretched, (width, height), interpolation=cv2.INTER_CUBIC)
     panel[:] = np.clip(np.rint(enlarged), 0.0, 255.0)[..., None]
-    at = project_outlines(outlines, rig, T_camera_lidar)
+    at = difference_regions.project_outlines(outlines, rig, T_camera_lidar)
     on_panel = drawing.places(at.uv_px, part, Rectangle(0, 0, width, height))
     pieces = on_panel[outlines.pieces[at.seen[outlines.pieces].all(axis=1)]]
     for colour_of_line, line_width in ((drawing.BLACK, 4), (colour, 2)):
@@ -285,7 +285,9 @@ def _scale_bar(panel: Pixels, camera: Camera, part: Rectangle) -> None:
     height, width = panel.shape[:2]
     length = max((bar for bar in BAR_LENGTHS_PX if bar <= BAR_SHARE * part.width), default=BAR_LENGTHS_PX[0])
     u, v = part.left + 0.5 * part.width, part.top + 0.5 * part.height
-    (angle_deg,) = angles_deg(camera, np.array([[u - 0.5 * length, v]]), np.array([[u + 0.5 * length, v]]))
+    (angle_deg,) = difference_regions.angles_deg(
+        camera, np.array([[u - 0.5 * length, v]]), np.array([[u + 0.5 * length, v]])
+    )
     angle = f" = {angle_deg:.2f}°" if np.isfinite(angle_deg) else ""
     x, y = round(0.03 * width), round(0.93 * height)
     bar = Rectangle(x, y, round(length * width / part.width), max(4, round(0.025 * height)))

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.highlighter import JSONHighlighter
@@ -34,8 +34,10 @@ from rich.text import Text
 
 from coec.geometry import compilation_events
 from coec.reports import formatting
-from coec.schemas import replies
 from coec.untrusted import json_printable, printable, printable_lines
+
+if TYPE_CHECKING:
+    from coec.schemas import replies
 
 LINE_S = 30.0
 """Time between two lines without a terminal: the log of an hour has about a hundred."""

@@ -31,20 +31,7 @@ from coec.schemas.keys import Keys
 from coec.service.camera_lidar_pair import CameraLidarPair
 from coec.service.cpu_budget import Budget
 from coec.service.decision_log import MOST_CHECKS, MOST_ENTRIES, Decision, Difference, decisions_of
-from coec.service.engine.messages import (
-    Action,
-    Evaluate,
-    Event,
-    JobDone,
-    JobSubject,
-    PairRequest,
-    RecordBetween,
-    RecordPair,
-    SensorTime,
-    SubmitCheck,
-    Tick,
-    WindowSubject,
-)
+from coec.service.engine import messages
 from coec.service.engine.rig import RigEstimator
 from coec.service.engine.vehicle import Vehicle
 from coec.service.ingest.decoder import CAMERA, EGO, LIDAR
@@ -138,14 +125,14 @@ class _ReplayVehicle(Vehicle):
 
     def __init__(self, config: Config, rig: RigEstimator, clock: DriveClock) -> None:
         super().__init__(config.limits, Budget(config.budget, clock.monotonic_s), rig, lambda _: None, clock=clock)
-        self._outcomes: queue.SimpleQueue[tuple[str, JobSubject, JobOutcome]] = queue.SimpleQueue()
-        self._arrived: list[tuple[str, JobSubject, JobOutcome]] = []
+        self._outcomes: queue.SimpleQueue[tuple[str, messages.JobSubject, JobOutcome]] = queue.SimpleQueue()
+        self._arrived: list[tuple[str, messages.JobSubject, JobOutcome]] = []
 
-    def post_outcome(self, receiver: str, subject: JobSubject, outcome: JobOutcome) -> None:
+    def post_outcome(self, receiver: str, subject: messages.JobSubject, outcome: JobOutcome) -> None:
         """Called on the thread of a worker."""
         self._outcomes.put((receiver, subject, outcome))
 
-    def deliver(self, requested: JobSubject) -> None:
+    def deliver(self, requested: messages.JobSubject) -> None:
         """Posts the outcome about `requested` if it has come; waits up to `POLL_S` for any."""
         with suppress(queue.Empty):
             if not any(subject == requested for _, subject, _ in self._arrived):
@@ -210,11 +197,15 @@ class _ReplayedPair(CameraLidarPair):
         self.transitions: list[Transition] = []
         super().__init__(pair, config, context)
 
-    def _step(self, event: Event) -> None:
+    def _step(self, event: messages.Event) -> None:
         before = self.engine.store.state.health.value
         actions = self.engine.step(event)
         health = (before, self.engine.store.state.health.value)
-        idle = not actions if isinstance(event, SensorTime | Evaluate) else isinstance(event, Tick)
+        idle = (
+            not actions
+            if isinstance(event, messages.SensorTime | messages.Evaluate)
+            else isinstance(event, messages.Tick)
+        )
         if not idle or health[0] != health[1]:
             stamp_ns = self._context.vehicle.clock.wall_ns()
             self.transitions.append(Transition(stamp_ns, _event_text(event), tuple(_action_texts(actions)), health))
@@ -224,7 +215,7 @@ class _ReplayedPair(CameraLidarPair):
         """Sensor time has come to the end of the open slice."""
         end_ns = self.engine.selector.slice_end_ns
         if end_ns is not None:
-            self._step(SensorTime(end_ns))
+            self._step(messages.SensorTime(end_ns))
 
 
 class DriveReplay:
@@ -331,8 +322,8 @@ class DriveReplay:
                 self._deliver_oldest(pair.engine.oldest_request)
             self._settle()
 
-    def _deliver_oldest(self, request: PairRequest) -> None:
-        self._vehicle.deliver(request.subject if isinstance(request.subject, WindowSubject) else request)
+    def _deliver_oldest(self, request: messages.PairRequest) -> None:
+        self._vehicle.deliver(request.subject if isinstance(request.subject, messages.WindowSubject) else request)
 
 
 def _packed(frame: Frame) -> tuple[str, bytes]:
@@ -346,13 +337,13 @@ def _packed(frame: Frame) -> tuple[str, bytes]:
             return EGO, encode_ego(frame)
 
 
-def _event_text(event: Event) -> str:
+def _event_text(event: messages.Event) -> str:
     match event:
-        case Evaluate():
+        case messages.Evaluate():
             return "frame pair"
-        case JobDone(subject=WindowSubject() as subject):
+        case messages.JobDone(subject=messages.WindowSubject() as subject):
             return f"window {subject.window_id} solved: {event.outcome.fate.value}"
-        case JobDone():
+        case messages.JobDone():
             return f"job ended: {event.outcome.fate.value}"
         case _:
             return _type_label(event)
@@ -363,14 +354,14 @@ def _type_label(value: object) -> str:
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(value).__name__).lower()
 
 
-def _action_texts(actions: Sequence[Action]) -> Iterator[str]:
+def _action_texts(actions: Sequence[messages.Action]) -> Iterator[str]:
     for action in actions:
         match action:
-            case RecordPair() | RecordBetween():
+            case messages.RecordPair() | messages.RecordBetween():
                 yield f"{_type_label(action)} for {action.window_id}"
             case SliceClosed():
                 yield f"end of {action.window_id} with {count(action.pairs, 'pair')}"
-            case SubmitCheck():
+            case messages.SubmitCheck():
                 yield f"check of {count(len(action.pairs), 'pair')}, counts from {action.request.due_ns} ns"
             case _:
                 yield _type_label(action)

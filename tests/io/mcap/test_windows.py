@@ -31,8 +31,16 @@ from coec.calibration.types import (
 from coec.errors import RecordingError, WindowError
 from coec.geometry import se3
 from coec.io.mcap.reader import McapDamagedError, read_records
-from coec.io.mcap.windows import is_window, pairs_since, read_result, read_window
-from coec.io.mcap.windows import RecordedWindow, WindowWriter, salvage, write_result
+from coec.io.mcap.windows import (
+    RecordedWindow,
+    WindowWriter,
+    is_window,
+    pairs_since,
+    read_result,
+    read_window,
+    salvage,
+    write_result,
+)
 from coec.io.mcap.writer import PART_SUFFIX
 from coec.schemas.replies import MovedWithin, Reason
 from support.readers import read_recording

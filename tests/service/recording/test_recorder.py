@@ -23,8 +23,7 @@ from coec.config import CalibrationConfig, StateConfig
 from coec.errors import RecordingError
 from coec.geometry.cameras import build
 from coec.io.logs import LossCounter
-from coec.io.mcap.windows import read_window
-from coec.io.mcap.windows import WindowWriter
+from coec.io.mcap.windows import WindowWriter, read_window
 from coec.service.recording.recorder import (
     BETWEEN_WAITING,
     PAIRS_WAITING,

@@ -21,30 +21,22 @@ pairs give equal bytes: nothing in the file tells when or where it was written.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
+
 from pydantic import BaseModel, ConfigDict, ValidationError
+
 from coec.calibration.types import MOUNT_RAD, CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Rig, Window
 from coec.config import CalibrationConfig, LimitsConfig, Matrix4x4, describe
-from coec.errors import ConfigError, DecodeError, SourceError, WindowError
-from coec.io.mcap import reader
-from coec.io.mcap.writer import CHUNK_BYTES
-from coec.io.rig_files import matrix_rows, rig_from_json, rig_to_json, rigid_matrix
-from coec.io.ros import message_decoding, messages
-from coec.io.ros.point_clouds import WRITTEN_TIME
-from coec.schemas.message import from_json, to_json
-from coec.schemas.replies import CalibrationResult
-from collections.abc import Callable, Mapping
-from contextlib import suppress
-from dataclasses import dataclass
-from coec.calibration.types import FramePair, Matrix4, Rig
-from coec.config import CalibrationConfig
-from coec.errors import RecordingError, WindowError
+from coec.errors import ConfigError, DecodeError, RecordingError, SourceError, WindowError
 from coec.io import storage
+from coec.io.mcap import reader
 from coec.io.mcap.reader import Channel, McapAttachment, McapMessage, Metadata, Schema
 from coec.io.mcap.writer import (
+    CHUNK_BYTES,
     LZ4,
     PACKING,
     PART_SUFFIX,
@@ -56,11 +48,12 @@ from coec.io.mcap.writer import (
     failing_as_recording_error,
     with_suffix,
 )
-from coec.io.rig_files import mask_to_png
-from coec.io.ros import message_encoding, messages
+from coec.io.rig_files import mask_to_png, matrix_rows, rig_from_json, rig_to_json, rigid_matrix
+from coec.io.ros import message_decoding, message_encoding, messages
+from coec.io.ros.point_clouds import WRITTEN_TIME
 from coec.schemas.keys import DIAGNOSTICS, TF_STATIC
-from coec.schemas.message import to_json
-
+from coec.schemas.message import from_json, to_json
+from coec.schemas.replies import CalibrationResult
 
 SUFFIX = ".mcap"
 

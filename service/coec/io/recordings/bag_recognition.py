@@ -20,25 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
-from coec.calibration.frames.motion_evidence import (
-    LEAST_S,
-    PoseAndTwist,
-    TwistReading,
-    motions_of_poses,
-    reading_of_twists,
-)
+from coec.calibration.frames import motion_evidence, sweep_evidence
 from coec.calibration.frames.pairing import motion_at
-from coec.calibration.frames.sweep_evidence import (
-    LEAST_SPEED_MPS,
-    MOST_CLOUDS,
-    SAME,
-    SECTORS,
-    WHOLE,
-    clouds_in_turn,
-    compensated_for,
-    instants_s,
-    sectors,
-)
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Recognition, Rig
 from coec.config import CameraIntrinsics, FilePath, Matrix4x4, describe
 from coec.config.pose_forms import with_direction
@@ -107,7 +90,9 @@ class Readings:
         return cls(
             _value(query, "rings", {"lines": True, "none": False}),
             _value(query, "compensated", {"no": "", **{name: name for name in ("stamp", "begin", "middle", "end")}}),
-            _value(query, "clouds_per_sweep", {str(count): count for count in range(1, MOST_CLOUDS + 1)}),
+            _value(
+                query, "clouds_per_sweep", {str(count): count for count in range(1, sweep_evidence.MOST_CLOUDS + 1)}
+            ),
             _value(query, "motion", {"twist": "twist", "pose": "pose"}),
             _offset_ns(query, "camera_offset"),
             _offset_ns(query, "lidar_offset"),
@@ -123,7 +108,7 @@ def _value(query: dict[str, str], key: str, values: dict[str, Value]) -> Value |
         return None
     if query[key] not in values:
         names = list(values)
-        accepted = ", ".join(names) if len(names) < MOST_CLOUDS else f"{names[0]} to {names[-1]}"
+        accepted = ", ".join(names) if len(names) < sweep_evidence.MOST_CLOUDS else f"{names[0]} to {names[-1]}"
         raise UsageError(f"{key}={query[key]}: it is one of {accepted}")
     return values[query[key]]
 
@@ -152,10 +137,10 @@ def motion_of_odometry(
     if motion == "pose":
         return _by_poses(reader, places), None
     sampled = [_posed(reader, places[index]) for index in _near_each_other(places)]
-    reading = reading_of_twists(sampled)
-    if reading is TwistReading.AS_STATED:
+    reading = motion_evidence.reading_of_twists(sampled)
+    if reading is motion_evidence.TwistReading.AS_STATED:
         return None, None
-    if reading is TwistReading.CONTRADICTED:
+    if reading is motion_evidence.TwistReading.CONTRADICTED:
         text = (
             "The velocities of the odometry do not fit its poses; the velocities are used. If the poses are right, say "
             "?motion=pose; ?motion=twist leaves out this line."
@@ -170,7 +155,7 @@ def motion_of_odometry(
 
 def _by_poses(reader: BagReader, places: Sequence[MessageLocation]) -> tuple[EgoMotion, ...]:
     """The motion by the poses, without jumps that no vehicle makes."""
-    motions = motions_of_poses([_posed(reader, place) for place in places])
+    motions = motion_evidence.motions_of_poses([_posed(reader, place) for place in places])
     return tuple(
         motion for motion in motions if max(map(abs, (*(motion.linear_mps or ()), *motion.angular_radps))) <= MAX_SPEED
     )
@@ -182,15 +167,15 @@ def _near_each_other(places: Sequence[MessageLocation]) -> list[int]:
     for start in evenly_spread(len(places), SAMPLED_MOVES):
         for index in range(start, min(start + MOST_BETWEEN, len(places))):
             selected.add(index)
-            if places[index].stamp_ns - places[start].stamp_ns >= LEAST_S * 1e9:
+            if places[index].stamp_ns - places[start].stamp_ns >= motion_evidence.LEAST_S * 1e9:
                 break
     return sorted(selected)
 
 
-def _posed(reader: BagReader, place: MessageLocation) -> PoseAndTwist:
+def _posed(reader: BagReader, place: MessageLocation) -> motion_evidence.PoseAndTwist:
     payload = reader.read(place.at)
     try:
-        return PoseAndTwist(odometry_pose(payload), message_decoding.odometry(payload))
+        return motion_evidence.PoseAndTwist(odometry_pose(payload), message_decoding.odometry(payload))
     except DecodeError as error:
         raise SourceError(f"the {messages.ODOMETRY} of {place.stamp_ns} ns: {error}") from error
 
@@ -224,13 +209,17 @@ def sweeps_of_clouds(
         )
         return alone, (Recognition("several_lidars", text, "warn"),)
     # A LiDAR that does not turn shows the same sectors at once.
-    if not seen or sectors(seen[0]).sum() >= WHOLE * SECTORS or not _turning(seen):
+    if (
+        not seen
+        or sweep_evidence.sectors(seen[0]).sum() >= sweep_evidence.WHOLE * sweep_evidence.SECTORS
+        or not _turning(seen)
+    ):
         return alone, ()
-    seen += [load(place) for place in places[len(seen) : MOST_CLOUDS]]
-    in_turn = clouds_in_turn([sectors(one) for one in seen])
+    seen += [load(place) for place in places[len(seen) : sweep_evidence.MOST_CLOUDS]]
+    in_turn = sweep_evidence.clouds_in_turn([sweep_evidence.sectors(one) for one in seen])
     if in_turn == 1:
         return alone, ()
-    degrees = 360 * float(np.median([sectors(one).sum() for one in seen])) / SECTORS
+    degrees = 360 * float(np.median([sweep_evidence.sectors(one).sum() for one in seen])) / sweep_evidence.SECTORS
     what = f"Each cloud covers {degrees:.0f} degrees of the turn, {in_turn} in a row the whole"
     if in_turn == 2 and seen[0].time_offset_s is None:
         text = (
@@ -259,8 +248,8 @@ def _overlap(clouds: Sequence[LidarFrame]) -> bool:
 
 def _turning(seen: Sequence[LidarFrame]) -> bool:
     """Whether clouds look into different directions."""
-    covered = [sectors(one) for one in seen]
-    return bool(np.any(covered, axis=0).sum() > SAME * np.median([one.sum() for one in covered]))
+    covered = [sweep_evidence.sectors(one) for one in seen]
+    return bool(np.any(covered, axis=0).sum() > sweep_evidence.SAME * np.median([one.sum() for one in covered]))
 
 
 def _joined(places: Sequence[MessageLocation], count: int) -> list[Sweep]:
@@ -316,9 +305,9 @@ def compensated(
     moving = []
     for sweep in sweeps:
         motion = motion_at(motions, sweep.stamp_ns, MOTION_REACH_NS // 5)
-        if motion is not None and motion.reaches(LEAST_SPEED_MPS):
+        if motion is not None and motion.reaches(sweep_evidence.LEAST_SPEED_MPS):
             moving.append((sweep, motion))
-    instant = compensated_for(moving, T_lidar_ego)
+    instant = sweep_evidence.compensated_for(moving, T_lidar_ego)
     if instant is None:
         return None, None
     text = (
@@ -330,7 +319,7 @@ def compensated(
 
 def as_compensated(sweep: LidarFrame, instant: str) -> LidarFrame:
     """The sweep, all its points at the instant for which they were compensated."""
-    at_s = instants_s(sweep).get(instant)
+    at_s = sweep_evidence.instants_s(sweep).get(instant)
     if at_s is None:
         return sweep
     return replace(sweep, time_offset_s=np.full(len(sweep.xyz_m), at_s, np.float32))

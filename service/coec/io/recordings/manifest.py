@@ -22,19 +22,9 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 from ruamel.yaml.nodes import CollectionNode, MappingNode, Node
 
+from coec.calibration import types
 from coec.calibration.frames.lidar_origin import ApparentOrigin, SeveralOrigins
 from coec.calibration.search.mistakes import INVERSE_POSE
-from coec.calibration.types import (
-    CameraFrame,
-    CloudFrame,
-    EgoMotion,
-    EncodedImage,
-    ImageFormat,
-    LidarFrame,
-    Matrix4,
-    Mistake,
-    Rig,
-)
 from coec.config import (
     IDENTITY,
     CameraIntrinsics,
@@ -156,7 +146,7 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
         raise SourceError(f"{path}: {describe(error)}") from error
     except ConfigError as error:
         raise SourceError(f"{path}: {error}") from error
-    rig = Rig(
+    rig = types.Rig(
         pair=document.pair,
         camera=camera,
         camera_frame=CAMERA_FRAME,
@@ -164,7 +154,7 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
         T_camera_lidar_nominal=T_camera_lidar,
         T_lidar_ego=np.eye(4),
         mask=mask,
-        cloud=None if np.array_equal(T_cloud_lidar, np.eye(4)) else CloudFrame(CLOUD_FRAME, T_cloud_lidar),
+        cloud=None if np.array_equal(T_cloud_lidar, np.eye(4)) else types.CloudFrame(CLOUD_FRAME, T_cloud_lidar),
     )
     frames = sorted(document.frames, key=lambda frame: frame.stamp_ns)
     _check_frames(path, frames)
@@ -172,7 +162,7 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
     scale = _DepthScale([depth for depth in depths if depth.suffix == ".npy"])
     layout = CloudLayout(document.cloud_columns, document.cloud_time)
     motions = [
-        EgoMotion(frame.stamp_ns, LIDAR_FRAME, frame.twist.linear_mps, frame.twist.angular_radps)
+        types.EgoMotion(frame.stamp_ns, LIDAR_FRAME, frame.twist.linear_mps, frame.twist.angular_radps)
         for frame in frames
         if frame.twist is not None
     ]
@@ -227,7 +217,7 @@ def _cloud_stamp_ns(frame: FrameDocument) -> int:
 
 
 def _recorded(
-    folder: Path, frame: FrameDocument, scale: _DepthScale, T_cloud_lidar: Matrix4, layout: CloudLayout
+    folder: Path, frame: FrameDocument, scale: _DepthScale, T_cloud_lidar: types.Matrix4, layout: CloudLayout
 ) -> RecordedFrame:
     cloud_stamp_ns = _cloud_stamp_ns(frame)
     return RecordedFrame(
@@ -244,19 +234,19 @@ _ADVICE = {
 }
 
 
-def _load_lidar(path: Path, stamp_ns: int, T_cloud_lidar: Matrix4, layout: CloudLayout) -> LidarFrame:
+def _load_lidar(path: Path, stamp_ns: int, T_cloud_lidar: types.Matrix4, layout: CloudLayout) -> types.LidarFrame:
     return measured_from(load_cloud(stamp_ns, LIDAR_FRAME, path, layout), T_cloud_lidar, LIDAR_FRAME, path, _ADVICE)
 
 
-def _load_camera(folder: Path, frame: FrameDocument, scale: _DepthScale) -> CameraFrame:
+def _load_camera(folder: Path, frame: FrameDocument, scale: _DepthScale) -> types.CameraFrame:
     depth = None
     if frame.depth is not None:
         file = folder / frame.depth
         depth = scale.encode(file) if file.suffix == ".npy" else load_image(file)
-    return CameraFrame(frame.stamp_ns, CAMERA_FRAME, _load_any_image(folder / frame.image), depth=depth)
+    return types.CameraFrame(frame.stamp_ns, CAMERA_FRAME, _load_any_image(folder / frame.image), depth=depth)
 
 
-def _load_any_image(path: Path) -> EncodedImage:
+def _load_any_image(path: Path) -> types.EncodedImage:
     """JPEG and PNG files as they are; any other image that OpenCV can read as raw 8-bit pixels."""
     data = read_bytes(path)
     try:
@@ -271,7 +261,7 @@ def _load_any_image(path: Path) -> EncodedImage:
     if pixels is None:
         raise SourceError(f"{path} is not an image that OpenCV reads")
     height, width = pixels.shape[:2]
-    return raw_image(ImageFormat.BGR8, width, height, pixels.tobytes(), LimitsConfig())
+    return raw_image(types.ImageFormat.BGR8, width, height, pixels.tobytes(), LimitsConfig())
 
 
 class _DepthScale:
@@ -291,7 +281,7 @@ class _DepthScale:
             self._least = min(least for least, _ in extremes)
             self._span = max(greatest for _, greatest in extremes) - self._least
 
-    def encode(self, path: Path) -> EncodedImage:
+    def encode(self, path: Path) -> types.EncodedImage:
         """The map as a 16-bit grey PNG.
 
         Raises:
@@ -349,7 +339,7 @@ def has_manifest(source: str) -> bool:
     return spec.layout is None and not is_bag(spec) and is_manifest
 
 
-def write_corrected(path: Path, mistake: Mistake, camera: Camera, T_camera_lidar: Matrix4) -> Correction:
+def write_corrected(path: Path, mistake: types.Mistake, camera: Camera, T_camera_lidar: types.Matrix4) -> Correction:
     """Writes `NAME.fixed.yaml` next to a manifest. `camera` and `T_camera_lidar` (4, 4) are what the manifest gives.
 
     Raises:
@@ -403,7 +393,7 @@ def _root(text: str, path: Path) -> MappingNode:
     return root
 
 
-def _pose_edit(key: Node, value: Node, mistake: Mistake) -> tuple[list[tuple[int, int, str]], str]:
+def _pose_edit(key: Node, value: Node, mistake: types.Mistake) -> tuple[list[tuple[int, int, str]], str]:
     name = key.value
     if mistake.code == INVERSE_POSE and name in OTHER_DIRECTION:
         other = OTHER_DIRECTION[name]
@@ -413,7 +403,7 @@ def _pose_edit(key: Node, value: Node, mistake: Mistake) -> tuple[list[tuple[int
     return [(key.start_mark.index, _end(value), f"T_camera_lidar:{lines}")], f"{name} is replaced by another pose"
 
 
-def _orthonormal(T: Matrix4) -> Matrix4:
+def _orthonormal(T: types.Matrix4) -> types.Matrix4:
     """The pose with a rotation that is exact to rounding."""
     unit = se3.rotation_from_quaternion_xyzw(se3.quaternion_xyzw_from_rotation(T[:3, :3]))
     return se3.transform_from(unit, T[:3, 3])

@@ -18,14 +18,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from coec.calibration.frames.lidar_origin import (
-    NO_SCAN_LINES,
-    ApparentOrigin,
-    OriginCheck,
-    SeveralOrigins,
-    from_origin,
-    unordered,
-)
+from coec.calibration.frames import lidar_origin
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import (
     IDENTITY,
@@ -282,8 +275,8 @@ ORIGIN_PERIOD_NS = 10**9
 
 EXPLAINED = frozenset(
     {
-        ApparentOrigin.cause,
-        SeveralOrigins.cause,
+        lidar_origin.ApparentOrigin.cause,
+        lidar_origin.SeveralOrigins.cause,
         WRONG_TYPE,
         Refusal.MESSAGE_TYPE,
         Refusal.CLOUD_FIELDS,
@@ -394,7 +387,7 @@ class Decoder:
         self._received = self._accepted = 0
         lidar = stream if isinstance(stream, LidarConfig) else None
         self._T_cloud_lidar = np.array(IDENTITY if lidar is None else lidar.T_cloud_lidar, dtype=np.float64)
-        self._origin = OriginCheck()
+        self._origin = lidar_origin.OriginCheck()
         self._checked_period: int | None = None
         self._contradicted = self._ring_reported = False
         self._ordered = True
@@ -518,13 +511,13 @@ class Decoder:
         frame."""
         if cloud.frame_id != (lidar.cloud_frame_id or lidar.frame_id):
             raise DecodeError("frame_id", "differs from the frame id in the configuration")
-        sweep = from_origin(cloud, self._T_cloud_lidar, lidar.frame_id)
+        sweep = lidar_origin.from_origin(cloud, self._T_cloud_lidar, lidar.frame_id)
         contradiction = self._contradiction(sweep)
         if contradiction is not None:
             raise DecodeError(contradiction.cause, f"{contradiction.sentence} See lidar.{contradiction.setting}.")
-        return sweep if self._ordered else unordered(sweep)
+        return sweep if self._ordered else lidar_origin.unordered(sweep)
 
-    def _contradiction(self, sweep: LidarFrame) -> ApparentOrigin | SeveralOrigins | None:
+    def _contradiction(self, sweep: LidarFrame) -> lidar_origin.ApparentOrigin | lidar_origin.SeveralOrigins | None:
         """What in a sweep contradicts the configured origin; None: nothing. Also notes whether rings are scan lines.
         Looks at the first sweep of each period of sensor time, and at every sweep while there is a contradiction: the
         frame in which a driver sends changes with its configuration, not from sweep to sweep."""
@@ -543,7 +536,7 @@ class Decoder:
         self._ordered = self._origin.has_scan_lines(sweep)
         if not self._ordered and not self._ring_reported:
             self._ring_reported = True
-            _log.warning(NO_SCAN_LINES.text, extra={"fields": {"sensor": self._stream.sensor}})
+            _log.warning(lidar_origin.NO_SCAN_LINES.text, extra={"fields": {"sensor": self._stream.sensor}})
         self._contradicted = contradiction is not None
         return contradiction
 

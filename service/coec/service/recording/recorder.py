@@ -20,8 +20,7 @@ from coec.config import CalibrationConfig
 from coec.errors import CoecError, RecordingError, WindowError
 from coec.io import storage
 from coec.io.logs import LossCounter
-from coec.io.mcap.windows import pairs_since, read_result
-from coec.io.mcap.windows import RecordedWindow, WindowWriter, salvage
+from coec.io.mcap.windows import RecordedWindow, WindowWriter, pairs_since, read_result, salvage
 from coec.io.system import ServiceThread
 from coec.schemas.replies import CalibrationResult
 from coec.service.recording.snippets import SnippetRecorder
