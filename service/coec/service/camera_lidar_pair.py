@@ -23,7 +23,7 @@ from coec.service.engine.schedule import Request, Schedule
 from coec.service.ingest.decoder import Frame
 from coec.service.ingest.frame_buffers import FrameRing
 from coec.service.ingest.sensor_stream import SensorStream
-from coec.service.recording.recorder import Recorder, RecordingPlan, WindowRecorded
+from coec.service.recording.recorder import RecordBetween, Recorder, RecordingPlan, RecordPair, WindowRecorded
 from coec.service.recording.snippets import SnippetRecorder
 from coec.service.records.pair_store import PairStore
 from coec.service.records.rig_store import RigBaseline
@@ -183,10 +183,8 @@ class CameraLidarPair:
     def _do(self, actions: Iterable[messages.Action]) -> None:
         for action in actions:
             match action:
-                case messages.RecordPair():
-                    self.recorder.add(action.window_id, action.pair, action.T_camera_lidar)
-                case messages.RecordBetween():
-                    self.recorder.add_between(action.window_id, action.pair)
+                case RecordPair() | RecordBetween():
+                    self.recorder.add(action)
                 case SliceClosed():
                     self.recorder.end(action)
                 case messages.UseCalibration():

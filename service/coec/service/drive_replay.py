@@ -36,7 +36,7 @@ from coec.service.engine.rig import RigEstimator
 from coec.service.engine.vehicle import Vehicle
 from coec.service.ingest.decoder import CAMERA, EGO, LIDAR
 from coec.service.process_lifetime import joined
-from coec.service.recording.recorder import RecordingThread
+from coec.service.recording.recorder import RecordBetween, RecordingThread, RecordPair
 from coec.service.recording.window_store import WindowStore
 from coec.service.records.pair_store import PairRecords
 from coec.service.records.state_store import StateStore
@@ -357,7 +357,7 @@ def _type_label(value: object) -> str:
 def _action_texts(actions: Sequence[messages.Action]) -> Iterator[str]:
     for action in actions:
         match action:
-            case messages.RecordPair() | messages.RecordBetween():
+            case RecordPair() | RecordBetween():
                 yield f"{_type_label(action)} for {action.window_id}"
             case SliceClosed():
                 yield f"end of {action.window_id} with {count(action.pairs, 'pair')}"

@@ -254,6 +254,11 @@ class PairAnswers:
     # --- on any -----------------------------------------------------------------------------------------------------
 
     @property
+    def calibrated(self) -> "PairAnswers":
+        """What a pair with a calibration answers."""
+        return self
+
+    @property
     def recorded(self) -> int:
         """Number of windows recorded since the start."""
         return self._recorder.recorded
@@ -481,55 +486,13 @@ class PendingPairAnswers:
         """The health: unknown, with the reasons."""
         return self._snapshot.answer(form)
 
-    def extrinsic(self, form: Format) -> Answer:
-        """Always refuses.
+    @property
+    def calibrated(self) -> Never:
+        """Refuses every other question.
 
         Raises:
-            AwaitedError: there is no nominal calibration yet.
+            PendingPairError: there is no nominal calibration yet.
         """
-        del form
-        self._refuse()
-
-    def exported(self, form: str, frames: ExportFrames) -> Answer:
-        """As `extrinsic`."""
-        del form, frames
-        self._refuse()
-
-    def history(self, since_ns: int, until_ns: int, limit: int) -> replies.HistoryReply:
-        """As `extrinsic`, because it depends on the rig whose history it is."""
-        del since_ns, until_ns, limit
-        self._refuse()
-
-    def windows(self, form: Format) -> Answer:
-        """As `extrinsic`."""
-        del form
-        self._refuse()
-
-    def read_window(self, window_id: str, offset: int, length: int) -> bytes:
-        """As `extrinsic`."""
-        del window_id, offset, length
-        self._refuse()
-
-    def events(self) -> replies.EvidenceReply:
-        """As `extrinsic`."""
-        self._refuse()
-
-    def event(self, event_id: str) -> replies.EvidenceEvent:
-        """As `extrinsic`."""
-        del event_id
-        self._refuse()
-
-    def event_overlay(self, event_id: str, side: Side) -> bytes:
-        """As `extrinsic`."""
-        del event_id, side
-        self._refuse()
-
-    def overlay(self, window_id: str | None, *, nominal: bool) -> bytes:
-        """As `extrinsic`."""
-        del window_id, nominal
-        self._refuse()
-
-    def _refuse(self) -> Never:
         raise PendingPairError(_sentence(self._nominal))
 
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 from functools import partial
 
 import zenoh
-from pydantic import BaseModel
 
 from coec.errors import UsageError
 from coec.io.exported_extrinsic import ExportFrames
@@ -176,8 +175,8 @@ class VehicleRoutes:
             Route(keys.extrinsic(name), lambda request: _extrinsic(pair, request), QueryLane.AT_ONCE),
             Route(keys.health(name), lambda request: pair.health(_format(request)), QueryLane.AT_ONCE),
             self._metered(Route(keys.history(name), lambda request: _history(pair, request), QueryLane.FILES)),
-            Route(keys.windows(name), lambda request: pair.windows(_format(request)), QueryLane.FILES),
-            Route(keys.evidence(name), lambda request: _in_format(request, pair.events), QueryLane.FILES),
+            Route(keys.windows(name), lambda request: pair.calibrated.windows(_format(request)), QueryLane.FILES),
+            Route(keys.evidence(name), lambda request: _evidence_list(pair, request), QueryLane.FILES),
             self._metered(Route(keys.overlay(name), lambda request: _overlay(pair, request), QueryLane.DRAWING)),
         )
         return {route.key: route for route in routes}
@@ -190,7 +189,7 @@ class VehicleRoutes:
     def _window(self, pair: AnyPairAnswers, window_id: str) -> Callable[[Request], Answer]:
         def answer(request: Request) -> Answer:
             selector = parse_range_selector(request.parameters)
-            return Answer(pair.read_window(window_id, selector.offset, selector.length), OCTETS)
+            return Answer(pair.calibrated.read_window(window_id, selector.offset, selector.length), OCTETS)
 
         return answer
 
@@ -198,8 +197,8 @@ class VehicleRoutes:
         def answer(request: Request) -> Answer:
             selector = parse_evidence_selector(request.parameters)
             if selector.overlay is not None:
-                return Answer(pair.event_overlay(event_id, selector.overlay), JPEG)
-            return answer_of(pair.event(event_id), selector.format)
+                return Answer(pair.calibrated.event_overlay(event_id, selector.overlay), JPEG)
+            return answer_of(pair.calibrated.event(event_id), selector.format)
 
         return answer
 
@@ -207,23 +206,23 @@ class VehicleRoutes:
 def _extrinsic(pair: AnyPairAnswers, request: Request) -> Answer:
     selector = parse_extrinsic_selector(request.parameters, NAMES)
     if selector.export is None:
-        return pair.extrinsic(selector.format)
-    return pair.exported(selector.export, ExportFrames(selector.parent, selector.child))
+        return pair.calibrated.extrinsic(selector.format)
+    return pair.calibrated.exported(selector.export, ExportFrames(selector.parent, selector.child))
 
 
 def _overlay(pair: AnyPairAnswers, request: Request) -> Answer:
     selector = parse_overlay_selector(request.parameters)
-    return Answer(pair.overlay(selector.window_id, nominal=selector.at == "nominal"), JPEG)
+    return Answer(pair.calibrated.overlay(selector.window_id, nominal=selector.at == "nominal"), JPEG)
 
 
 def _history(pair: AnyPairAnswers, request: Request) -> Answer:
     selector = parse_history_selector(request.parameters)
-    return answer_of(pair.history(selector.since_ns, selector.until_ns, selector.limit), selector.format)
+    return answer_of(pair.calibrated.history(selector.since_ns, selector.until_ns, selector.limit), selector.format)
 
 
-def _in_format(request: Request, make: Callable[[], BaseModel]) -> Answer:
+def _evidence_list(pair: AnyPairAnswers, request: Request) -> Answer:
     form = _format(request)
-    return answer_of(make(), form)
+    return answer_of(pair.calibrated.events(), form)
 
 
 def _format(request: Request) -> Format:

@@ -17,6 +17,7 @@ from coec.io.logs import LossCounter
 from coec.service.cpu_budget import Budget
 from coec.service.engine import messages
 from coec.service.engine.rig import RigMember
+from coec.service.recording.recorder import RecordBetween, RecordPair
 from coec.service.recording.window_store import start_ns_of
 from coec.service.records.pair_store import ServedExtrinsic
 from coec.service.timing import NS_PER_S, SensorClock
@@ -227,12 +228,12 @@ class FrameSelector:
         for event in self._cutter.offer(pair, T_camera_lidar):
             if isinstance(event, window.PairSelected):
                 self._frozen = False
-                actions.append(messages.RecordPair(event.window_id, event.pair, T_camera_lidar))
+                actions.append(RecordPair(event.window_id, event.pair, T_camera_lidar))
                 if self._infers:
                     actions.append(messages.Prefetch(event.pair.camera))
                 self._log_progress(event.window_id)
             elif isinstance(event, window.PairBetween):
-                actions.append(messages.RecordBetween(event.window_id, event.pair))
+                actions.append(RecordBetween(event.window_id, event.pair))
             elif isinstance(event, window.SliceClosed):
                 actions.append(self._close(event, pair.stamp_ns))
                 self._urgency.on_slice_closed(event, self._cutter, self._pace.rate_hz)

@@ -377,13 +377,7 @@ def answer_request(solver: Solver, message: dict[str, Any]) -> dict[str, Any]:
         )
     except CoecError as error:
         end = types.Reason(error.reply_code, str(error))
-    if isinstance(end, types.Reason):
-        return worker_jobs.pack_refusal(number, end)
-    return (
-        worker_jobs.pack_underway(number, end)
-        if isinstance(end, worker_jobs.Underway)
-        else worker_jobs.pack_answer(number, end)
-    )
+    return worker_jobs.pack_answer(number, end)
 
 
 def _answer_once(

@@ -382,19 +382,11 @@ class MalformedAnswerError(Exception):
     """An answer is not of the documented form. The message says what is wrong, but quotes none of its values."""
 
 
-def pack_answer(number: int, answer: Answer | None) -> dict[str, Any]:
-    """The answer to the question of this number; None if the question asks for nothing."""
-    return {"id": number, "result": None if answer is None else wire_form().unstructure(answer)}
-
-
-def pack_refusal(number: int, reason: Reason) -> dict[str, Any]:
-    """The refusal of the question of this number, with its reason."""
-    return {"id": number, "refused": wire_form().unstructure(reason)}
-
-
-def pack_underway(number: int, underway: Underway) -> dict[str, Any]:
-    """The answer that the work of the question of this number is not complete."""
-    return {"id": number, "underway": wire_form().unstructure(underway)}
+def pack_answer(number: int, answer: Answer | Underway | Reason | None) -> dict[str, Any]:
+    """The answer to the question of this number: a result, how far the work is, or why it is refused; None if the
+    question asks for nothing."""
+    kind = "refused" if isinstance(answer, Reason) else "underway" if isinstance(answer, Underway) else "result"
+    return {"id": number, kind: None if answer is None else wire_form().unstructure(answer)}
 
 
 def number_of(message: Mapping[str, Any]) -> int:
