@@ -20,9 +20,8 @@ from coec.io.serialise import reasons_of
 from coec.io.system import ServiceManagerNotifier, ServiceThread, resident_bytes
 from coec.io.zenoh.bus import Answer, Bus, open_session
 from coec.io.zenoh.command_auth import CommandListener, credentials_of
-from coec.io.zenoh.endpoints import redacted
 from coec.io.zenoh.ros_node import RosPublishers, RosSide
-from coec.io.zenoh.session import Reach, connected_of, mode_of, settings_of, unguarded
+from coec.io.zenoh.session import Reach, connected_of, mode_of, redacted, settings_of, unguarded
 from coec.io.zenoh.singleton import SingletonGuard, rival_text, unproven_text
 from coec.schemas import replies
 from coec.schemas.keys import Keys

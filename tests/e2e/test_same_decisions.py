@@ -22,8 +22,7 @@ from coec.config import (
 )
 from coec.io.mcap.writer import write_bag
 from coec.io.zenoh.player import Frame
-from coec.service.decision_log import differences, read_log
-from coec.service.drive_replay import DriveReplay
+from coec.service.drive_replay import DriveReplay, differences, read_log
 from e2e.drives import (
     NS_PER_S,
     SECONDS,

@@ -40,7 +40,6 @@ from coec.config import (
 )
 from coec.errors import SourceError, UsageError
 from coec.geometry.cameras import build, project_point
-from coec.io.baseline_file import baseline_to_json, load_baseline
 from coec.io.depth.model_cards import CARDS, read_card
 from coec.io.images import Inspector, decode_bgr, decode_depth, encode_depth_png, encode_png
 from coec.io.logs import LossCounter
@@ -52,7 +51,7 @@ from coec.io.recordings.cloud_files import load_cloud
 from coec.io.recordings.kitti import read_numbers, read_stamps
 from coec.io.recordings.layouts import open_source
 from coec.io.recordings.recording_source import RecordingSource
-from coec.io.rig_files import camera_of, rig_of, rig_to_json
+from coec.io.rig_files import baseline_to_json, camera_of, load_baseline, rig_of, rig_to_json
 from coec.io.ros import message_decoding, message_encoding, messages
 from coec.io.ros.camera_info import decode_info, intrinsics_of_info
 from coec.io.ros.message_decoding import ENCODINGS

@@ -27,7 +27,7 @@ from coec.io.images import GreyImages
 from coec.io.mcap.windows import WindowWriter, read_window, write_result
 from coec.io.recordings import window_cutting
 from coec.io.serialise import result_of
-from coec.schemas.fleet import WindowRow
+from coec.schemas.documents import WindowRow
 from coec.schemas.replies import CalibrationResult, Reason, Verdict
 from support.simulated_drives import rendered_drive
 

@@ -20,7 +20,7 @@ from coec.reports.formatting import count
 
 if TYPE_CHECKING:
     from coec.fleet.worker_pool import Engine, WorkerLimits
-    from coec.schemas.fleet import BatchReport, WindowRow
+    from coec.schemas.documents import BatchReport, WindowRow
 
 MIB = 2**20
 

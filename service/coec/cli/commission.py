@@ -61,7 +61,7 @@ def commission(
 ) -> int:
     """Learn the baseline of a rig from windows in which its calibration is right: bias, spread, every limit."""
     from coec.calibration.commissioning import commission as learn
-    from coec.io.baseline_file import load_baselines, save_baseline
+    from coec.io.rig_files import load_baselines, save_baseline
     from coec.io.user_files import try_file
     from coec.reports import page
     from coec.reports.baseline_page import baselines_page
@@ -151,7 +151,7 @@ def document_of(baseline: Baseline) -> dict[str, Any]:
     """What `--json` prints: the baseline as it is written, its hash, and bias and spread in degrees and metres."""
     import numpy as np
 
-    from coec.io.baseline_file import baseline_hash, baseline_to_json
+    from coec.io.rig_files import baseline_hash, baseline_to_json
     from coec.io.serialise import in_degrees
 
     sigma = baseline.accuracy.sigma(baseline.pairs)
@@ -166,7 +166,7 @@ def document_of(baseline: Baseline) -> dict[str, Any]:
 
 def show(baseline: Baseline) -> None:
     """Prints the baseline for people."""
-    from coec.io.baseline_file import baseline_hash
+    from coec.io.rig_files import baseline_hash
 
     console.show(
         f"{baseline.pair}: commissioned from {count(baseline.pairs, 'pair')} of "

@@ -114,7 +114,7 @@ def _baseline(file: Path | None, window: Window, rigged: RigWindows) -> Baseline
         UsageError: the file has none, or it does not hold for this recording.
     """
     from coec.calibration.baseline import learned_hash, mismatch
-    from coec.io.baseline_file import load_baseline
+    from coec.io.rig_files import load_baseline
 
     if file is None:
         return None

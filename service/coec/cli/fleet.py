@@ -17,7 +17,7 @@ from coec.reports.formatting import count
 
 if TYPE_CHECKING:
     from coec.calibration.baseline import Baseline
-    from coec.schemas.fleet import FleetNow, FleetReport
+    from coec.schemas.documents import FleetNow, FleetReport
 
 app = typer.Typer(no_args_is_help=True, help="Combine results of many vehicles.")
 
@@ -68,7 +68,7 @@ def report(
 
 def _show(summary: FleetReport) -> None:
     from coec.reports import fleet_page
-    from coec.schemas.fleet import AXES
+    from coec.schemas.documents import AXES
 
     console.show(fleet_page.sentence(summary))
     table = console.table(
@@ -100,7 +100,7 @@ def _show(summary: FleetReport) -> None:
 
 
 def _fleet_now(path: Path) -> FleetNow:
-    from coec.schemas.fleet import FleetNow
+    from coec.schemas.documents import FleetNow
     from coec.schemas.message import from_json
 
     try:
@@ -112,13 +112,13 @@ def _fleet_now(path: Path) -> FleetNow:
 
 
 def _show_sql(results: Path) -> None:
-    from coec.fleet import tables
+    from coec.fleet.report import EXAMPLE_QUERIES, WINDOWS_VIEW, columns, view_statement
 
-    console.write(f"-- the view `{tables.WINDOWS_VIEW}` of the examples below\n")
-    console.write(f"{tables.view_statement(tables.WINDOWS_VIEW, results)};\n\n")
-    for name, kind in tables.columns(results):
+    console.write(f"-- the view `{WINDOWS_VIEW}` of the examples below\n")
+    console.write(f"{view_statement(WINDOWS_VIEW, results)};\n\n")
+    for name, kind in columns(results):
         console.write(f"--   {name:<22} {kind}\n")
-    for question, query in tables.EXAMPLE_QUERIES.items():
+    for question, query in EXAMPLE_QUERIES.items():
         console.write(f"\n-- {question}{query};\n")
 
 
@@ -137,7 +137,7 @@ def commission(
 ) -> int:
     """Learn from commissioned vehicles what others of their model start from (`state.model`): bias, spread, limits."""
     from coec.calibration.baseline import model_baseline
-    from coec.io.baseline_file import load_baselines, save_baseline
+    from coec.io.rig_files import load_baselines, save_baseline
 
     vehicles = [load_baselines(path) for path in _each_once(baselines)]
     for path, pairs in zip(baselines, vehicles, strict=True):

@@ -211,9 +211,8 @@ def service_address(
         ConfigError: the configuration, or the Zenoh configuration, cannot be read.
     """
     from coec.config import Config, ZenohConfig, load_config
-    from coec.io.zenoh.endpoints import credentials_in, read_settings
     from coec.io.zenoh.query_client import RouterAddress
-    from coec.io.zenoh.session import connected_of
+    from coec.io.zenoh.session import connected_of, credentials_in, read_settings
 
     if config is not None:
         loaded = load_config(config)

@@ -18,8 +18,7 @@ from coec.reports.formatting import count
 if TYPE_CHECKING:
     from coec.config import Config
     from coec.io.recordings.recording_source import RecordingSource, SensorMessage
-    from coec.service.decision_log import Difference
-    from coec.service.drive_replay import ReplayedDrive
+    from coec.service.drive_replay import Difference, ReplayedDrive
 
 NS_PER_S = 1_000_000_000
 
@@ -113,7 +112,7 @@ def _replay_window(window: Path, depth: str | None, *, as_json: bool) -> int:
     from coec.io.mcap.windows import read_result, read_window
     from coec.io.serialise import comparable, result_of
     from coec.schemas.message import to_json
-    from coec.service.decision_log import value_differences
+    from coec.service.drive_replay import value_differences
 
     recorded = read_result(window)
     if recorded is None:
@@ -211,7 +210,7 @@ def _show_drive(
     explain_s: float | None,
     as_json: bool,
 ) -> int:
-    from coec.service.decision_log import differences, read_log, write_log
+    from coec.service.drive_replay import differences, read_log, write_log
 
     log, against, report = files
     first_ns = recording.camera_stamps_ns[0]

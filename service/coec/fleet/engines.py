@@ -26,7 +26,7 @@ from coec.fleet import worker_pool
 from coec.fleet.evaluator import ReplaySettings, WindowEvaluator
 from coec.fleet.jobs import Job, StoreCredentials, failed_row, is_path, stores_of
 from coec.io.system import ONE_THREAD, one_thread_each, resident_bytes
-from coec.schemas.fleet import WindowRow
+from coec.schemas.documents import WindowRow
 
 STOP_TIMEOUT_S = 5.0
 """Longest wait for a process that was told to end, s."""

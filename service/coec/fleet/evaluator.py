@@ -27,7 +27,7 @@ from coec.io.mcap.windows import read_result, read_vehicle, read_window
 from coec.io.rig_files import rig_from_json, rig_to_json
 from coec.io.serialise import comparable, result_of
 from coec.reports.page_parts import versions
-from coec.schemas.fleet import WindowRow
+from coec.schemas.documents import WindowRow
 from coec.schemas.message import to_json
 from coec.schemas.replies import CalibrationResult
 

@@ -30,8 +30,7 @@ from coec.io.images import NEAREST_M, GreyImages, decode_bgr, decode_grey, encod
 from coec.io.user_files import write_output
 from coec.reports import drawing
 from coec.reports.charts import Tick, linear_ticks, tick_label
-from coec.reports.close_ups import Caption, close_ups, difference_text
-from coec.reports.difference_regions import angles_deg, evenly
+from coec.reports.close_ups import Caption, angles_deg, close_ups, difference_text, evenly
 from coec.reports.drawing import LABEL_PX, LINE_PX, Pixels, render_points, titled
 from coec.reports.formatting import count, instant, number
 from coec.reports.page import Block, Compare, Picture, Pictures, Text

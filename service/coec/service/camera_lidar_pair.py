@@ -20,9 +20,8 @@ from coec.service.engine.frame_selector import FrameSelector
 from coec.service.engine.pair import Pair
 from coec.service.engine.pair_stream import PairStream
 from coec.service.engine.schedule import Request, Schedule
-from coec.service.ingest.decoder import Frame
+from coec.service.ingest.decoder import Frame, SensorStream
 from coec.service.ingest.frame_buffers import FrameRing
-from coec.service.ingest.sensor_stream import SensorStream
 from coec.service.recording.recorder import RecordBetween, Recorder, RecordingPlan, RecordPair, WindowRecorded
 from coec.service.recording.snippets import SnippetRecorder
 from coec.service.records.pair_store import PairStore

@@ -1,5 +1,9 @@
 """Replays a recorded drive through the engine of the service: which checks and windows it makes of it, what it serves,
-and when; and what it decided, for people to read.
+and when; what it decided in the order of sensor time, how two such logs differ, and both for people to read.
+
+A log is made of the records of a pair: every check, every window's estimate, every extrinsic that was served, every
+state of health. It has one JSON object a line. States that the steady clock alone brings about, such as a check that is
+overdue, have no sensor time and depend on the machine; a log leaves them out, and the return from them.
 
 The engine is that of the service; no thread runs it. The sensor time of the frames is the clock, so no frame is dropped
 and no time passes while a job runs. A result is handed to the engine when the drive has come to the sensor time from
@@ -8,19 +12,22 @@ which it counts, so two replays are equal to the byte whatever the machine does.
 
 from __future__ import annotations
 
+import json
 import queue
 import re
+import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from tempfile import TemporaryDirectory
+from typing import Any, cast
 
 from coec.calibration.frames.window import SliceClosed
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import BudgetConfig, Config, PairConfig
-from coec.errors import SourceError
+from coec.errors import SourceError, UsageError
 from coec.io.disk_writer import DiskWriter
 from coec.io.msgpack_frames import encode_camera, encode_ego, encode_lidar
 from coec.io.zenoh.bus import MSGPACK, InputSample
@@ -30,7 +37,6 @@ from coec.reports.page import Facts, Page, Section, Table, Text, write
 from coec.schemas.keys import Keys
 from coec.service.camera_lidar_pair import CameraLidarPair
 from coec.service.cpu_budget import Budget
-from coec.service.decision_log import MOST_CHECKS, MOST_ENTRIES, Decision, Difference, decisions_of
 from coec.service.engine import messages
 from coec.service.engine.rig import RigEstimator
 from coec.service.engine.vehicle import Vehicle
@@ -38,12 +44,176 @@ from coec.service.ingest.decoder import CAMERA, EGO, LIDAR
 from coec.service.process_lifetime import joined
 from coec.service.recording.recorder import RecordBetween, RecordingThread, RecordPair
 from coec.service.recording.window_store import WindowStore
+from coec.service.records.history import CheckLog, PairHistory
 from coec.service.records.pair_store import PairRecords
 from coec.service.records.state_store import StateStore
 from coec.service.timing import NS_PER_S, Clock
 from coec.service.vehicle_context import VehicleContext
 from coec.service.worker.supervisor import Worker, WorkerState
 from coec.service.worker.worker_jobs import JobOutcome, Kind, WorkerJob
+
+KINDS = ("check", "estimate", "extrinsic", "state")
+"""Of decisions, in the order in which those of one stamp are listed."""
+
+MOST_ENTRIES, MOST_CHECKS = 10_000, 100_000
+"""Entries of the history, and checks, of a log: as many as a service can keep."""
+
+MOST_BYTES = 2**28
+"""Largest log that is read."""
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """One decision.
+
+    Attributes:
+        kind: one of `KINDS`.
+        stamp_ns: sensor time of the data behind it.
+        name: what it is about: id of the window, outcome of the checks, provenance of the extrinsic, state.
+        values: everything that is compared.
+    """
+
+    kind: str
+    stamp_ns: int
+    name: str
+    values: dict[str, Any]
+
+    def line(self) -> str:
+        """As a line of a log."""
+        document = {"kind": self.kind, "stamp_ns": self.stamp_ns, "name": self.name, "values": self.values}
+        return json.dumps(document, sort_keys=True, separators=(",", ":"))
+
+
+def decisions_of(records: PairRecords) -> tuple[Decision, ...]:
+    """The decisions in the records of a pair."""
+    return tuple(sorted(_decisions(records), key=lambda one: (one.stamp_ns, KINDS.index(one.kind))))
+
+
+def _decisions(records: PairRecords) -> Iterator[Decision]:
+    for check in records.checks:
+        values = check.model_dump(mode="json", exclude={"state"})
+        yield Decision("check", check.stamp_ns, check.outcome, values)
+    state = ""
+    for record in records.entries:
+        entry = record.entry
+        if entry.stamp_ns is None or (entry.kind == "state" and entry.code == state):
+            continue
+        state = entry.code if entry.kind == "state" else state
+        if record.result is not None:
+            yield Decision("estimate", entry.stamp_ns, entry.code, record.result.model_dump(mode="json"))
+        elif entry.kind in ("extrinsic", "state"):
+            pose = None if entry.camera_from_lidar is None else entry.camera_from_lidar.model_dump(mode="json")
+            values = {"code": entry.code, "window_id": entry.window_id, "camera_from_lidar": pose}
+            yield Decision(entry.kind, entry.stamp_ns, entry.code, values)
+
+
+def read_log(path: Path, pair: str) -> tuple[Decision, ...]:
+    """The decisions in a log, or in the state directory of a service.
+
+    Raises:
+        SourceError: there is no such file, or it is neither.
+    """
+    if path.is_dir():
+        return _of_state_directory(path, pair)
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise SourceError(f"{path} is larger than {MOST_BYTES / 1e6:.0f} MB: it is no log of decisions")
+        documents = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        return tuple(
+            Decision(str(one["kind"]), int(one["stamp_ns"]), str(one["name"]), dict(one["values"])) for one in documents
+        )
+    except OSError as error:
+        raise SourceError(f"{path} cannot be read: {error.strerror}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise SourceError(f"{path} is no log of decisions: write one with `coec replay DRIVE --log FILE`") from error
+
+
+def _of_state_directory(folder: Path, pair: str) -> tuple[Decision, ...]:
+    """Reads copies of the files, because damaged ones are set aside when they are opened."""
+    with TemporaryDirectory() as copies:
+        try:
+            for file in folder.glob(f"*-{pair}.jsonl"):
+                if file.stat().st_size > MOST_BYTES:
+                    raise SourceError(f"{file} is larger than {MOST_BYTES / 1e6:.0f} MB")
+                shutil.copyfile(file, Path(copies) / file.name)
+        except OSError as error:
+            raise SourceError(f"{folder} cannot be read: {error.strerror}") from error
+        history = PairHistory(Path(copies), pair, MOST_ENTRIES, {})
+        checks = CheckLog(Path(copies) / f"checks-{pair}.jsonl", MOST_CHECKS)
+        decisions = decisions_of(PairRecords(history.entries(), checks.checks(), ()))
+    if not decisions:
+        others = sorted(file.stem.removeprefix("checks-") for file in folder.glob("checks-*.jsonl"))
+        hint = f"; it has those of {', '.join(others)}: give the service's --config" if others else ""
+        raise SourceError(f"{folder} holds no records of a pair {pair}{hint}")
+    return decisions
+
+
+def write_log(path: Path, decisions: Iterable[Decision]) -> None:
+    """Writes a log.
+
+    Raises:
+        UsageError: the file cannot be written.
+    """
+    try:
+        path.write_text("".join(f"{one.line()}\n" for one in decisions), encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{path} cannot be written: {error.strerror}") from error
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """A decision that differs. `before`, `after`: None if there is none of this kind at this sensor time. `fields`:
+    places of the values that differ."""
+
+    before: Decision | None
+    after: Decision | None
+    fields: tuple[str, ...] = ()
+
+    @property
+    def either(self) -> Decision:
+        """The decision, of whichever log has it."""
+        decision = self.after or self.before
+        assert decision is not None
+        return decision
+
+
+def differences(before: Sequence[Decision], after: Sequence[Decision]) -> tuple[Difference, ...]:
+    """What differs between two logs, in the order of sensor time. Decisions of one kind and stamp belong together."""
+    keyed_before, keyed_after = _keyed(before), _keyed(after)
+    result = []
+    for key in sorted(keyed_before.keys() | keyed_after.keys()):
+        one, other = keyed_before.get(key), keyed_after.get(key)
+        if one is None or other is None:
+            result.append(Difference(one, other))
+        elif one.values != other.values:
+            places = (place.partition("[")[0] for place, _, _ in value_differences(one.values, other.values))
+            result.append(Difference(one, other, tuple(dict.fromkeys(places))))
+    return tuple(result)
+
+
+def _keyed(decisions: Sequence[Decision]) -> dict[tuple[int, int, int], Decision]:
+    """By stamp, kind, and number among those of one stamp and kind."""
+    keyed: dict[tuple[int, int, int], Decision] = {}
+    for decision in decisions:
+        kind = KINDS.index(decision.kind) if decision.kind in KINDS else len(KINDS)
+        number = 0
+        while (decision.stamp_ns, kind, number) in keyed:
+            number += 1
+        keyed[decision.stamp_ns, kind, number] = decision
+    return keyed
+
+
+def value_differences(before: Any, after: Any, at: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """(place, before, after) of every value that differs between two documents."""
+    if isinstance(before, dict) and isinstance(after, dict):
+        for key in sorted(before.keys() | after.keys()):
+            yield from value_differences(before.get(key), after.get(key), f"{at}.{key}" if at else str(key))
+    elif isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
+        for index, (one, other) in enumerate(zip(before, after, strict=True)):
+            yield from value_differences(one, other, f"{at}[{index}]")
+    elif before != after:
+        yield at, before, after
+
 
 POLL_S = 0.02
 """Longest wait for a worker or the disk before events are looked for again, s."""

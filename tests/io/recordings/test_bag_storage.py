@@ -218,9 +218,9 @@ def test_a_schema_that_makes_messages_up_is_refused(
 def test_a_bag_that_grows_without_end_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: CompressionMode
 ) -> None:
-    monkeypatch.setattr("coec.io.recordings.bag_folder.MAX_RATIO", 2)
     monkeypatch.setattr("coec.io.recordings.bag_storage.MAX_RATIO", 2)
-    monkeypatch.setattr("coec.io.recordings.bag_folder.MAX_UNPACKED_MESSAGE_BYTES", 30_000)
+    monkeypatch.setattr("coec.io.recordings.bag_storage.MAX_RATIO", 2)
+    monkeypatch.setattr("coec.io.recordings.bag_storage.MAX_UNPACKED_MESSAGE_BYTES", 30_000)
     monkeypatch.setattr("coec.io.recordings.bag_storage.MAX_CHUNK_BYTES", 30_000)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     zeros = replace(compressed_image_message(5), data=np.zeros(20_000, np.uint8))

@@ -127,8 +127,7 @@ def _configuration(path: Path) -> tuple[Config | None, Finding]:
     from coec.cli.doctor.environment import fail, ok
     from coec.config import load_config
     from coec.io.rig_files import check_given, rig_of
-    from coec.io.zenoh.endpoints import Endpoint
-    from coec.io.zenoh.session import connected_of, listened_of, settings_of
+    from coec.io.zenoh.session import Endpoint, connected_of, listened_of, settings_of
     from coec.service.discovery import with_discovered
 
     advice = "correct it, or name another with --config; `coec check-config FILE` prints what a file comes to"

@@ -23,20 +23,25 @@ from coec.config import Config, StateConfig
 from coec.errors import CoecError, NotFoundError, UnavailableError
 from coec.io.system import clock_state, lock_holder
 from coec.io.zenoh.bus import closed, is_connected, open_session
-from coec.io.zenoh.endpoints import (
+from coec.io.zenoh.query_client import query_all, query_one
+from coec.io.zenoh.session import (
     CERTIFIED,
     WITH_PORT,
     Certificate,
     CertificateError,
     Endpoint,
+    connected_of,
+    finds_peers,
     host_and_port,
+    listened_of,
+    mode_of,
+    open_client,
     read_certificate,
     redacted,
+    settings_of,
     shake_hands,
     tls_files,
 )
-from coec.io.zenoh.query_client import query_all, query_one
-from coec.io.zenoh.session import connected_of, finds_peers, listened_of, mode_of, open_client, settings_of
 from coec.io.zenoh.session import to_observer as as_separate_client
 from coec.schemas.documents import Finding, Level
 from coec.schemas.keys import Keys

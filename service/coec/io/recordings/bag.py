@@ -16,9 +16,8 @@ from coec.config import CalibrationConfig
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.io.mcap.windows import is_window, read_window
 from coec.io.recordings import bag_index, bag_recognition, recording_source
-from coec.io.recordings.bag_folder import open_storage
 from coec.io.recordings.bag_recognition import PairMessages, Sweep, lidar_frame_of, rig_of_bag
-from coec.io.recordings.bag_storage import BagReader, BagStorage
+from coec.io.recordings.bag_storage import BagReader, BagStorage, open_storage
 from coec.io.recordings.cloud_files import measured_from
 from coec.io.recordings.recording_source import evenly_spread
 from coec.io.ros import messages

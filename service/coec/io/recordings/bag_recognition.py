@@ -24,14 +24,13 @@ from coec.calibration.frames import motion_evidence, sweep_evidence
 from coec.calibration.frames.pairing import motion_at
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Recognition, Rig
 from coec.config import CameraIntrinsics, FilePath, Matrix4x4, describe
-from coec.config.pose_forms import with_direction
+from coec.config.pair import with_direction
 from coec.errors import ConfigError, DecodeError, SourceError, UsageError
 from coec.geometry.projection import share_in_image
 from coec.io.frame_validation import MAX_SPEED
 from coec.io.intrinsics_files import load_camera_document, with_camera
-from coec.io.recordings.bag_folder import METADATA
 from coec.io.recordings.bag_index import LISTED, BagIndex, MessageLocation
-from coec.io.recordings.bag_storage import BagReader
+from coec.io.recordings.bag_storage import METADATA, BagReader
 from coec.io.recordings.recording_source import MOTION_REACH_NS, evenly_spread
 from coec.io.rig_files import camera_of, load_mask, rigid_matrix
 from coec.io.ros import camera_info, message_decoding, messages

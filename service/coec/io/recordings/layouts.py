@@ -10,9 +10,8 @@ import numpy as np
 from coec.calibration.rig.lidar_sampling import LidarRig, SweepPair
 from coec.calibration.types import EgoMotion, LidarFrame, Matrix4
 from coec.errors import DecodeError, SourceError, UsageError
-from coec.io.recordings.bag_folder import open_storage
 from coec.io.recordings.bag_index import CLOUD_TYPES, VELOCITY_TYPES, CloudDecoder, MessageLocation, build_index
-from coec.io.recordings.bag_storage import BagStorage
+from coec.io.recordings.bag_storage import BagStorage, open_storage
 from coec.io.recordings.recording_source import (
     FORMS,
     MOTION_REACH_NS,

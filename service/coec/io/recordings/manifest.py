@@ -35,7 +35,7 @@ from coec.config import (
     describe,
     load_yaml,
 )
-from coec.config.pose_forms import Pose, with_direction
+from coec.config.pair import Pose, with_direction
 from coec.errors import ConfigError, DecodeError, OutputError, SourceError, UsageError
 from coec.geometry import cameras, se3
 from coec.geometry.cameras import Camera

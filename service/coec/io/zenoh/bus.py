@@ -25,7 +25,6 @@ from coec.config import Config, LimitsConfig, StreamConfig, ZenohConfig
 from coec.errors import CoecError, UnavailableError, UsageError
 from coec.io.ros import wire_format
 from coec.io.system import ServiceThread
-from coec.io.zenoh.endpoints import without_secrets
 from coec.io.zenoh.session import (
     check_certificates,
     endpoints_of,
@@ -34,6 +33,7 @@ from coec.io.zenoh.session import (
     settings_of,
     settings_source,
     to_second_session,
+    without_secrets,
 )
 from coec.schemas.message import to_json, to_msgpack
 from coec.schemas.replies import ErrorReply

@@ -37,8 +37,7 @@ from coec.errors import (
 from coec.io import storage
 from coec.io.user_files import require_absent
 from coec.io.zenoh.command_auth import CommandSender
-from coec.io.zenoh.endpoints import read_settings, redacted
-from coec.io.zenoh.session import check_certificates, open_client
+from coec.io.zenoh.session import check_certificates, open_client, read_settings, redacted
 from coec.schemas.commands import ProvenCommand
 from coec.schemas.keys import MAX_COMMAND_TIMEOUT_MS, MAX_LENGTH, Keys
 from coec.schemas.message import from_json, from_msgpack, to_json

@@ -33,8 +33,7 @@ from coec.service.engine.rig import (
 )
 from coec.service.engine.schedule import Request, Schedule
 from coec.service.engine.vehicle import Vehicle
-from coec.service.ingest.decoder import EGO, LIDAR, Frame
-from coec.service.ingest.sensor_stream import SensorStream
+from coec.service.ingest.decoder import EGO, LIDAR, Frame, SensorStream
 from coec.service.timing import NS_PER_S
 from coec.service.worker import worker_jobs
 from coec.service.worker.supervisor import Worker

@@ -23,13 +23,12 @@ from coec.calibration.rig.lidar_sampling import LidarRig, SweepPair
 from coec.config import CalibrationConfig, Config, DepthConfig
 from coec.errors import CoecError, DecodeError, RecordingError, StateError, WindowError
 from coec.geometry.points import lengths
-from coec.io.baseline_file import BASELINES, baseline_of_rig, save_baseline
 from coec.io.converter import structured
 from coec.io.depth.depth_maps import CachedDepth, open_depth
 from coec.io.images import CachedGreys, GreyImages, RangeScale, decode_bgr, encode_jpeg, scale_of, stable_scale
 from coec.io.msgpack_frames import decode_camera
 from coec.io.nearest_neighbours import Trees, installed
-from coec.io.rig_files import rig_of
+from coec.io.rig_files import BASELINES, baseline_of_rig, rig_of, save_baseline
 from coec.reports.close_ups import Caption, close_ups
 from coec.reports.drawing import render_points, titled
 from coec.reports.formatting import instant
