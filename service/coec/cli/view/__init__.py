@@ -127,7 +127,7 @@ def _show_vehicle(
         ConnectionFailedError: no router answered.
         UnavailableError: the address cannot be listened on.
     """
-    from coec.cli.view.vehicle import VehiclePair, show_live
+    from coec.cli.view.sources import VehiclePair, show_live
     from coec.config import load_config
     from coec.io.rig_files import rig_of
     from coec.io.zenoh.query_client import connected_by
@@ -157,7 +157,7 @@ def _show_recording(
         UsageError, SourceError, WindowError: no such recording or result, or the library is missing.
         UnavailableError: the address cannot be listened on.
     """
-    from coec.cli.view.recording import Playback, load_candidate, show_recording
+    from coec.cli.view.sources import Playback, load_candidate, show_recording
     from coec.io.recordings.layouts import open_source
 
     recording = open_source(source)
