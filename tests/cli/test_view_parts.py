@@ -13,7 +13,14 @@ import pytest
 from cli.vehicle_on_screen import PAIR, RIG, configuration, extrinsic, health
 from coec.cli.view import ListenAddress, listen_address
 from coec.cli.view import sources as view_vehicle
-from coec.cli.view.sources import DEPTHS, SILENT_S, SensorStreams, ServiceState, extrinsics_of_service, moment_of_service
+from coec.cli.view.sources import (
+    DEPTHS,
+    SILENT_S,
+    SensorStreams,
+    ServiceState,
+    extrinsics_of_service,
+    moment_of_service,
+)
 from coec.config import load_config
 from coec.errors import UsageError
 from coec.io.msgpack_frames import encode_camera, encode_lidar

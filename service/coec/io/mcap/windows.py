@@ -34,20 +34,8 @@ from coec.config import CalibrationConfig, LimitsConfig, Matrix4x4, describe
 from coec.errors import ConfigError, DecodeError, RecordingError, SourceError, WindowError
 from coec.io import storage
 from coec.io.mcap import reader
+from coec.io.mcap import writer as mcap_writer
 from coec.io.mcap.reader import Channel, McapAttachment, McapMessage, Metadata, Schema
-from coec.io.mcap.writer import (
-    CHUNK_BYTES,
-    LZ4,
-    PACKING,
-    PART_SUFFIX,
-    REWRITE_SUFFIX,
-    FinishedFile,
-    RosChannel,
-    WholeFile,
-    check_stamp,
-    failing_as_recording_error,
-    with_suffix,
-)
 from coec.io.rig_files import mask_to_png, matrix_rows, rig_from_json, rig_to_json, rigid_matrix
 from coec.io.ros import message_decoding, message_encoding, messages
 from coec.io.ros.point_clouds import WRITTEN_TIME
@@ -241,7 +229,7 @@ def read_window(path: Path) -> tuple[Window, CalibrationConfig]:
     """
     content = WindowContent()
     size = _size(path)
-    for record in records_of(path, max_unpacked_bytes=size * MAX_UNPACKED + CHUNK_BYTES):
+    for record in records_of(path, max_unpacked_bytes=size * MAX_UNPACKED + mcap_writer.CHUNK_BYTES):
         content.add(record)
     rig, T_camera_lidar_start, window_id = content.head(path)
     places = sorted(content.parts)
@@ -265,7 +253,7 @@ def pairs_since(path: Path, since_ns: int) -> Iterator[FramePair]:
         WindowError: unreadable, cut off or damaged.
     """
     content = WindowContent()
-    for record in records_of(path, max_unpacked_bytes=_size(path) * MAX_UNPACKED + CHUNK_BYTES):
+    for record in records_of(path, max_unpacked_bytes=_size(path) * MAX_UNPACKED + mcap_writer.CHUNK_BYTES):
         place = content.add(record)
         if place is None:
             continue
@@ -376,7 +364,7 @@ class RecordedWindow:
     sha256: str
 
     @classmethod
-    def of(cls, file: FinishedFile, window_id: str, pairs: int) -> RecordedWindow:
+    def of(cls, file: mcap_writer.FinishedFile, window_id: str, pairs: int) -> RecordedWindow:
         """The window in a finished file."""
         return cls(file.path, window_id, pairs, file.bytes, file.modified_ns, file.sha256)
 
@@ -413,12 +401,16 @@ class WindowWriter:
         self.pairs = 0
         self._between = 0
         self._rig, self._T_start, self._window_id = rig, T_camera_lidar_start, window_id
-        self._file = WholeFile(temporary or with_suffix(path_final, PART_SUFFIX), path_final, packed=packed)
+        self._file = mcap_writer.WholeFile(
+            temporary or mcap_writer.with_suffix(path_final, mcap_writer.PART_SUFFIX), path_final, packed=packed
+        )
         self._file.attach(RIG, JSON, encode_rig(rig, T_camera_lidar_start, window_id))
         self._file.attach(CONFIGURATION, JSON, to_json(configuration))
         if rig.mask is not None:
             self._file.attach(MASK, "image/png", mask_to_png(rig.mask))
-        self._file.metadata(METADATA, {"window_id": window_id, PACKING: LZ4 if packed else "", **metadata})
+        self._file.metadata(
+            METADATA, {"window_id": window_id, mcap_writer.PACKING: mcap_writer.LZ4 if packed else "", **metadata}
+        )
         self._file.sync()
 
     def note_carried_over(self, from_window_id: str, since_ns: int) -> None:
@@ -495,7 +487,7 @@ class WindowWriter:
         try:
             for frame in (pair.camera, pair.lidar, pair.motion):
                 if frame is not None:
-                    check_stamp(frame.stamp_ns)
+                    mcap_writer.check_stamp(frame.stamp_ns)
         except RecordingError:
             self.abandon()
             raise
@@ -506,7 +498,7 @@ class WindowWriter:
     def _cdr(self, topic_name: str, type_name: str, stamp_ns: int, data: bytes, index: int | None = None) -> None:
         """Adds a message of the pair with this index; None: of the pair that is being added."""
         sequence = self.pairs if index is None else index
-        self._file.ros(RosChannel(topic_name, type_name), stamp_ns, sequence, data)
+        self._file.ros(mcap_writer.RosChannel(topic_name, type_name), stamp_ns, sequence, data)
 
 
 def write_result(path: Path, result: CalibrationResult, overlay_jpeg: bytes | None = None) -> RecordedWindow:
@@ -519,8 +511,8 @@ def write_result(path: Path, result: CalibrationResult, overlay_jpeg: bytes | No
         WindowError: the window is damaged.
         RecordingError: it could not be written; then the file is unchanged.
     """
-    packed = metadata_of(path).get(PACKING) == LZ4
-    file = WholeFile(with_suffix(path, REWRITE_SUFFIX), path, packed=packed)
+    packed = metadata_of(path).get(mcap_writer.PACKING) == mcap_writer.LZ4
+    file = mcap_writer.WholeFile(mcap_writer.with_suffix(path, mcap_writer.REWRITE_SUFFIX), path, packed=packed)
     result_topic, overlay = topic(result.pair, RESULT_TOPIC), topic(result.pair, OVERLAY)
     try:
         earlier, moved = (DIAGNOSTICS, result_topic, overlay), result.moved is not None
@@ -528,8 +520,8 @@ def write_result(path: Path, result: CalibrationResult, overlay_jpeg: bytes | No
         stamp_ns, document = result.data_stamp_ns, to_json(result)
         if overlay_jpeg is not None:
             picture = message_encoding.encode_jpeg(stamp_ns, result.camera_frame, overlay_jpeg)
-            file.ros(RosChannel(overlay, messages.COMPRESSED_IMAGE), stamp_ns, 0, picture)
-        file.ros(RosChannel(DIAGNOSTICS, messages.DIAGNOSTICS), stamp_ns, 0, _diagnostics(result))
+            file.ros(mcap_writer.RosChannel(overlay, messages.COMPRESSED_IMAGE), stamp_ns, 0, picture)
+        file.ros(mcap_writer.RosChannel(DIAGNOSTICS, messages.DIAGNOSTICS), stamp_ns, 0, _diagnostics(result))
         file.message(result_topic, "json", None, {}, stamp_ns, 0, document)
         file.attach(RESULT, JSON, document)
     except WindowError:
@@ -538,7 +530,7 @@ def write_result(path: Path, result: CalibrationResult, overlay_jpeg: bytes | No
     return RecordedWindow.of(file.finish(), window_id, pairs)
 
 
-def _copy(path: Path, file: WholeFile, leave_out: Callable[[str], bool]) -> tuple[str, int]:
+def _copy(path: Path, file: mcap_writer.WholeFile, leave_out: Callable[[str], bool]) -> tuple[str, int]:
     """Copies a window record by record, without its result and the topics to leave out. Returns its id and number of
     pairs."""
     schemas: dict[int, Schema] = {}
@@ -593,9 +585,9 @@ def salvage(part_path: Path, progress: Callable[[], None]) -> RecordedWindow | N
     Raises:
         RecordingError: it could not be written; the `.part` file is still there.
     """
-    final = part_path.with_name(part_path.name.removesuffix(PART_SUFFIX))
+    final = part_path.with_name(part_path.name.removesuffix(mcap_writer.PART_SUFFIX))
     window = None if final.exists() else _salvaged(part_path, final, progress)
-    with failing_as_recording_error(final):
+    with mcap_writer.failing_as_recording_error(final):
         storage.remove(part_path)
     return window
 
@@ -642,6 +634,6 @@ def _writer_like(content: WindowContent, part_path: Path, final: Path) -> Window
         window_id,
         configuration,
         content.metadata,
-        packed=content.metadata.get(PACKING) == LZ4,
-        temporary=with_suffix(final, REWRITE_SUFFIX),
+        packed=content.metadata.get(mcap_writer.PACKING) == mcap_writer.LZ4,
+        temporary=mcap_writer.with_suffix(final, mcap_writer.REWRITE_SUFFIX),
     )

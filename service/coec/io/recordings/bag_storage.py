@@ -32,17 +32,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from coec.config import describe, load_yaml
 from coec.errors import ConfigError, DecodeError, SourceError
-from coec.io.mcap.reader import (
-    MAX_CHUNK_BYTES,
-    MAX_RATIO,
-    MAX_ZSTD_WINDOW,
-    Channel,
-    McapDamagedError,
-    McapMessage,
-    MessageReader,
-    Schema,
-    read_records,
-)
+from coec.io.mcap import reader as mcap_reader
 from coec.io.mcap.windows import is_window
 from coec.io.recordings.recording_source import BAG_SUFFIXES
 from coec.io.ros import message_decoding, messages
@@ -116,28 +106,30 @@ class McapStorage:
 
     def entries(self) -> Iterator[BagMessage]:
         """See `Storage`."""
-        schemas: dict[int, Schema] = {}
-        channels: dict[int, Channel] = {}
+        schemas: dict[int, mcap_reader.Schema] = {}
+        channels: dict[int, mcap_reader.Channel] = {}
         try:
             with self.path.open("rb") as stream:
-                limit = MAX_CHUNK_BYTES + MAX_RATIO * self.path.stat().st_size
-                for record in read_records(stream, max_unpacked_bytes=limit):
+                limit = mcap_reader.MAX_CHUNK_BYTES + mcap_reader.MAX_RATIO * self.path.stat().st_size
+                for record in mcap_reader.read_records(stream, max_unpacked_bytes=limit):
                     match record:
-                        case Schema():
+                        case mcap_reader.Schema():
                             schemas[record.schema_id] = record
-                        case Channel():
+                        case mcap_reader.Channel():
                             channels[record.channel_id] = record
-                        case McapMessage():
+                        case mcap_reader.McapMessage():
                             channel = channels.get(record.channel_id)
                             schema = None if channel is None else schemas.get(channel.schema_id)
                             if channel is not None and schema is not None:
                                 yield from self._entry(channel, schema.name, record)
         except OSError as error:
             raise SourceError(f"cannot read {self.path}: {error.strerror}") from error
-        except McapDamagedError as error:
+        except mcap_reader.McapDamagedError as error:
             raise SourceError(error.of(self.path)) from error
 
-    def _entry(self, channel: Channel, type_name: str, message: McapMessage) -> Iterator[BagMessage]:
+    def _entry(
+        self, channel: mcap_reader.Channel, type_name: str, message: mcap_reader.McapMessage
+    ) -> Iterator[BagMessage]:
         chunk_at = _NO_CHUNK if message.chunk_at is None else message.chunk_at
         data = message.data
         place: tuple[int, ...] = (chunk_at, message.at, len(data))
@@ -157,20 +149,20 @@ class McapStorage:
     def open(self) -> Iterator[BagReader]:
         """See `Storage`."""
         with self.path.open("rb") as stream:
-            yield _McapReader(self.path, MessageReader(stream))
+            yield _McapReader(self.path, mcap_reader.MessageReader(stream))
 
 
 @dataclass(frozen=True, slots=True)
 class _McapReader:
     path: Path
-    reader: MessageReader
+    reader: mcap_reader.MessageReader
 
     def read(self, place: tuple[int, ...]) -> bytes:
         """See `Reader`."""
         chunk_at, at, length, *number = place
         try:
             data = self.reader.read(None if chunk_at == _NO_CHUNK else chunk_at, at, length)
-        except McapDamagedError as error:
+        except mcap_reader.McapDamagedError as error:
             raise SourceError(f"{self.path}: {error}") from error
         return translated(number[0], data, f"{self.path}: a message") if number else data
 
@@ -337,7 +329,7 @@ def _records(data: bytes, begin: int) -> Iterator[_Record]:
     at = 0
     while at < len(data):
         header, at = _span(data, at, begin, MAX_HEADER_BYTES)
-        body, end = _span(data, at, begin, MAX_CHUNK_BYTES)
+        body, end = _span(data, at, begin, mcap_reader.MAX_CHUNK_BYTES)
         yield _Record(_fields(header, begin + at), body, at + _LENGTH.size)
         at = end
 
@@ -377,7 +369,7 @@ class Ros1Storage:
         connections: dict[int, tuple[str, int]] = {}
         try:
             with self.path.open("rb") as stream:
-                left = MAX_CHUNK_BYTES + MAX_RATIO * self.path.stat().st_size
+                left = mcap_reader.MAX_CHUNK_BYTES + mcap_reader.MAX_RATIO * self.path.stat().st_size
                 for record, begin in _of_file(stream):
                     if record.operation != _CHUNK:
                         yield from self._entry(record, _NO_CHUNK, connections)
@@ -385,7 +377,9 @@ class Ros1Storage:
                     chunk = _unpacked(record)
                     left -= len(chunk)
                     if left < 0:
-                        raise ValueError(f"byte {record.at}: the file unpacks to more than {MAX_RATIO} times its size")
+                        raise ValueError(
+                            f"byte {record.at}: the file unpacks to more than {mcap_reader.MAX_RATIO} times its size"
+                        )
                     for inner in _records(chunk, record.at):
                         yield from self._entry(inner, begin, connections)
         except OSError as error:
@@ -443,7 +437,7 @@ def _next(stream: BinaryIO) -> _Record | None:
         return None
     header = _read(stream, length, MAX_HEADER_BYTES)
     at = stream.tell() + _LENGTH.size
-    return _Record(_fields(header, at), _read(stream, stream.read(_LENGTH.size), MAX_CHUNK_BYTES), at)
+    return _Record(_fields(header, at), _read(stream, stream.read(_LENGTH.size), mcap_reader.MAX_CHUNK_BYTES), at)
 
 
 def _read(stream: BinaryIO, length: bytes, most: int) -> bytes:
@@ -461,8 +455,10 @@ def _read(stream: BinaryIO, length: bytes, most: int) -> bytes:
 def _unpacked(record: _Record) -> bytes:
     """The records in a chunk."""
     size, compression = record.number(b"size"), record.fields.get(b"compression", b"none")
-    if size > MAX_CHUNK_BYTES:
-        raise ValueError(f"byte {record.at}: a chunk would unpack to {size} bytes, the limit is {MAX_CHUNK_BYTES}")
+    if size > mcap_reader.MAX_CHUNK_BYTES:
+        raise ValueError(
+            f"byte {record.at}: a chunk would unpack to {size} bytes, the limit is {mcap_reader.MAX_CHUNK_BYTES}"
+        )
     try:
         match compression:
             case b"none":
@@ -572,9 +568,9 @@ class FolderStorage:
             left = MAX_UNPACKED_MESSAGE_BYTES
             for entry in file.entries():
                 data = self.plain(entry.data)
-                left += MAX_RATIO * len(entry.data) - len(data)
+                left += mcap_reader.MAX_RATIO * len(entry.data) - len(data)
                 if left < 0:
-                    raise SourceError(f"{file.path} unpacks to more than {MAX_RATIO} times its size")
+                    raise SourceError(f"{file.path} unpacks to more than {mcap_reader.MAX_RATIO} times its size")
                 yield replace(entry, data=data, place=(number, *entry.place))
 
     @contextmanager
@@ -593,7 +589,7 @@ class FolderStorage:
                     f"{self.path}: a message does not state that it unpacks to at most "
                     f"{MAX_UNPACKED_MESSAGE_BYTES} bytes"
                 )
-            unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_ZSTD_WINDOW)
+            unpacker = zstandard.ZstdDecompressor(max_window_size=mcap_reader.MAX_ZSTD_WINDOW)
             return unpacker.decompress(data, max_output_size=MAX_UNPACKED_MESSAGE_BYTES)
         except zstandard.ZstdError as error:
             raise SourceError(f"{self.path} is damaged: a message is no zstd frame: {error}") from error
@@ -700,14 +696,14 @@ def _information(path: Path) -> BagInformation:
 def _unpacked_file(file: Path, folder: Path) -> Path:
     """A packed file (`name.mcap.zstd`), unpacked (`name.mcap`)."""
     target = folder / file.name.removesuffix(".zstd")
-    unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_ZSTD_WINDOW)
+    unpacker = zstandard.ZstdDecompressor(max_window_size=mcap_reader.MAX_ZSTD_WINDOW)
     try:
         with file.open("rb") as packed, target.open("wb") as plain:
-            left = MAX_UNPACKED_MESSAGE_BYTES + MAX_RATIO * file.stat().st_size
+            left = MAX_UNPACKED_MESSAGE_BYTES + mcap_reader.MAX_RATIO * file.stat().st_size
             for block in unpacker.read_to_iter(packed, write_size=_COPY_BYTES):
                 left -= len(block)
                 if left < 0:
-                    raise SourceError(f"{file} unpacks to more than {MAX_RATIO} times its size")
+                    raise SourceError(f"{file} unpacks to more than {mcap_reader.MAX_RATIO} times its size")
                 if shutil.disk_usage(folder).free < MIN_FREE_BYTES:
                     raise SourceError(f"{file} unpacks to more than {folder.parent} has room for")
                 plain.write(block)
