@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from coec.geometry.cameras import Camera
     from coec.io.recordings.window_cutting import LoadedWindow
     from coec.recording import Solution
-    from coec.reports.console import StageTimes
 
 
 @with_calibration_options(CalibrationOptions)

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from coec.calibration.baseline import Baseline
     from coec.calibration.types import DepthModel, ImageReader, Window
     from coec.config import CalibrationConfig
-    from coec.reports.console import StageTimes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +83,7 @@ def commission(
         )
     save_baseline(output, baseline)
     report = page.write(
-        _page_for(output),
+        output.with_suffix(".page.html" if output.suffix == ".html" else ".html"),  # never the baseline itself
         baselines_page(load_baselines(output), baseline.pair, sources, output.name, Provenance.here()),
     )
     if as_json:
@@ -93,11 +92,6 @@ def commission(
         show(baseline)
         console.show(f"written to {output}, with a page of it, {report.name}, beside it")
     return 0
-
-
-def _page_for(path: Path) -> Path:
-    """`rig.html` for `rig.json`; never the baseline itself."""
-    return path.with_suffix(".page.html" if path.suffix == ".html" else ".html")
 
 
 def load(sources: Sequence[str], options: SolverOptions, times: StageTimes) -> RigWindows:

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
     from coec.io.zenoh.query_client import RecordingInfo
     from coec.schemas.documents import Absent, FetchedFile, FetchedWindow, IncidentReport
-    from coec.schemas.keys import Keys
     from coec.schemas.message import Message
     from coec.schemas.replies import ChainedEntry, EvidenceEvent, HistoryReply, WindowsReply
 

@@ -15,7 +15,7 @@ from coec.reports import console
 from coec.reports.console import StageTimes
 
 if TYPE_CHECKING:
-    from coec.config import OpenPairConfig, PairConfig
+    pass
 
 SIZE = {"width": 160, "height": 120, "fx": 60.0, "fy": 60.0, "cx": 79.5, "cy": 59.5}
 """Kernels are compiled for types, not for sizes."""
@@ -79,15 +79,10 @@ def _lens_models(config: Path | None, lenses: Sequence[str] | None) -> list[str]
     if unknown := sorted(named - set(MODELS)):
         raise UsageError(f"--lens {unknown[0]}: unknown; known are {', '.join(MODELS)}")
     if config is not None:
-        models = set(map(_lens_model, load_config(config).every_pair))
+        lenses_of_pairs = (pair.camera.intrinsics for pair in load_config(config).every_pair)
+        models = {None if lens is None else lens.model for lens in lenses_of_pairs}  # None: of a `CameraInfo` to come
         named = set(MODELS) if None in models else {lens for lens in models if lens is not None}
     return [lens for lens in MODELS if lens in named]
-
-
-def _lens_model(pair: PairConfig | OpenPairConfig) -> str | None:
-    """The lens model of a pair; None if it is to come from `CameraInfo`."""
-    intrinsics = pair.camera.intrinsics
-    return None if intrinsics is None else intrinsics.model
 
 
 def _compile(lenses: Sequence[str]) -> int:

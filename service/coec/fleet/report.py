@@ -20,7 +20,7 @@ from coec.schemas import documents
 from coec.schemas.documents import AXES, WindowRow
 from coec.schemas.heartbeat import LastWord
 from coec.schemas.message import to_json
-from coec.schemas.replies import Alarms, Maybe6, Maybe6x6
+from coec.schemas.replies import Maybe6, Maybe6x6
 
 
 def optional_library(name: str) -> Any:
@@ -103,7 +103,8 @@ def write_tables(folder: Path, rows: Iterable[WindowRow], name: str) -> None:
     """
     groups: dict[str, list[WindowRow]] = defaultdict(list)
     for row in rows:
-        groups[_partition(row)].append(row)
+        date = UNDATED if row.result is None else f"{_time(row.result.data_stamp_ns):%Y-%m-%d}"
+        groups[f"date={date}/vehicle={quote(row.vehicle, safe='') or NAMELESS}"].append(row)
     for partition, group in sorted(groups.items()):
         user_files.replace_output(folder / partition / f"{name}.parquet", _parquet(group))
 
@@ -123,11 +124,6 @@ def tabulated_urls(folder: Path) -> set[str]:
         except (OSError, ValueError, KeyError) as error:
             raise SourceError(f"{path} is damaged ({error}): remove it, and its windows are evaluated again") from error
     return known
-
-
-def _partition(row: WindowRow) -> str:
-    date = UNDATED if row.result is None else f"{_time(row.result.data_stamp_ns):%Y-%m-%d}"
-    return f"date={date}/vehicle={quote(row.vehicle, safe='') or NAMELESS}"
 
 
 def _time(stamp_ns: int) -> datetime:
@@ -292,6 +288,7 @@ def false_alarms(heartbeats: Iterable[LastWord]) -> documents.FalseAlarms:
     ]
     watched_h = sum(alarms.watched_s for _, alarms in counted) / S_PER_H
     withdrawn = sum(alarms.withdrawn for _, alarms in counted)
+    most_first = sorted(counted, key=lambda entry: (-entry[1].withdrawn, entry[0]))
     return documents.FalseAlarms(
         pairs=len(counted),
         watched_h=watched_h,
@@ -299,12 +296,8 @@ def false_alarms(heartbeats: Iterable[LastWord]) -> documents.FalseAlarms:
         withdrawn=withdrawn,
         per_100_h=100.0 * withdrawn / watched_h if watched_h > 0.0 else None,
         per_100_h_at_most=100.0 * poisson_most(CONFIDENCE, withdrawn) / watched_h if watched_h > 0.0 else None,
-        by_pair={name: alarms.withdrawn for name, alarms in sorted(counted, key=_most_first) if alarms.withdrawn},
+        by_pair={name: alarms.withdrawn for name, alarms in most_first if alarms.withdrawn},
     )
-
-
-def _most_first(entry: tuple[str, Alarms]) -> tuple[int, str]:
-    return -entry[1].withdrawn, entry[0]
 
 
 REPORT_TABLE, EARLIER_VIEW = "read", "before"

@@ -181,7 +181,8 @@ def fitness_of(recording: RecordingSource) -> Fitness:
     )
     recognised = [Notice(one.level, one.code, one.text) for one in recognitions_of(recording, sweeps)]
     recognised += [*lens_notices(rig.camera), *([] if image is None else image_notices(image.image))]
-    return _with_remarks(seen, recognised)
+    remarks = [notice for notice in (*recognised, *_remarks(seen)) if notice is not None]
+    return replace(seen, remarks=tuple(sorted(remarks, key=lambda notice: _ORDER[notice.level])))
 
 
 def pairs_of_calibration(seen: Fitness) -> int:
@@ -247,11 +248,6 @@ def passes(sweep: types.LidarFrame) -> int:
         return 0
     span_s = float(times_s.max() - times_s.min())
     return 1 + int((np.diff(times_s) < -0.5 * span_s).sum())
-
-
-def _with_remarks(seen: Fitness, recognised: Sequence[Notice]) -> Fitness:
-    remarks = [notice for notice in (*recognised, *_remarks(seen)) if notice is not None]
-    return replace(seen, remarks=tuple(sorted(remarks, key=lambda notice: _ORDER[notice.level])))
 
 
 _ORDER: dict[Level, int] = {"fail": 0, "warn": 1, "ok": 2}

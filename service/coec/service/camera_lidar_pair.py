@@ -72,7 +72,9 @@ class CameraLidarPair:
         if context.snippets is not None:
             snippets = SnippetRecorder(plan.rig, plan.metadata, context.snippets, losses, packed=plan.packed)
         self.recorder = Recorder(plan, folder, losses, context.recording, vehicle.inbox.post, snippets)
-        ring = None if snippets is None else FrameRing(config.snippets, _ring_bytes(config), snippets.submit)
+        # Half of the pair's share, because as much again is in memory while a snippet is written.
+        ring_bytes = config.snippets.memory_bytes // (2 * max(len(config.every_pair), 1))
+        ring = None if snippets is None else FrameRing(config.snippets, ring_bytes, snippets.submit)
         self.stream = PairStream(pair, config, vehicle, losses, ring)
         self.commands = Commands(pair.name, config.vehicle, store, vehicle.inbox)
         self.answers = PairAnswers(
@@ -238,9 +240,3 @@ class CameraLidarPair:
                     self._context.folder.release(window_id)
             case Request():
                 self._context.vehicle.budget.release(self.name)
-
-
-def _ring_bytes(config: Config) -> int:
-    """Size of one pair's ring: half of the pair's share, because as much again is in memory while a snippet is
-    written."""
-    return config.snippets.memory_bytes // (2 * max(len(config.every_pair), 1))

@@ -581,17 +581,13 @@ def metadata_of(path: Path) -> dict[str, str]:
     return {}
 
 
-def _no_messages(_: Frame) -> list[tuple[str, str, bytes]]:
-    return []
-
-
 def write_bag(
     path: Path,
     rig: Rig,
     T_camera_lidar: Matrix4,
     frames: Iterable[Frame],
     on_frame: Callable[[Frame], None],
-    extra_messages: Callable[[Frame], Iterable[tuple[str, str, bytes]]] = _no_messages,
+    extra_messages: Callable[[Frame], Iterable[tuple[str, str, bytes]]] = lambda _: (),
 ) -> None:
     """Writes the frames on topics below `/<pair>/`, with the camera info of each image and one `/tf_static`.
 

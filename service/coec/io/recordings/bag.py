@@ -264,7 +264,8 @@ class BagRecording:
             def load(place: bag_index.MessageLocation) -> LidarFrame:
                 return self._cloud(reader, place)
 
-            sweeps, of_clouds = bag_recognition.sweeps_of_clouds(self._clouds(), load, readings.clouds)
+            clouds = [cloud for sweep in self.streams.lidar for cloud in sweep.clouds]
+            sweeps, of_clouds = bag_recognition.sweeps_of_clouds(clouds, load, readings.clouds)
             streams = _shifted(replace(self.streams, lidar=sweeps), readings)
             recording = replace(self, streams=streams, recognitions=(*self.recognitions, *of_clouds))
             if readings.rings is None and recording._is_unordered(reader):
@@ -275,9 +276,6 @@ class BagRecording:
                 instant, of_points = recording._compensated(reader)
         recognitions = (*recording.recognitions, *(() if of_points is None else (of_points,)))
         return replace(recording, recognitions=recognitions, compensated=instant or None)
-
-    def _clouds(self) -> list[bag_index.MessageLocation]:
-        return [cloud for sweep in self.streams.lidar for cloud in sweep.clouds]
 
     def _is_unordered(self, reader: BagReader) -> bool:
         """Whether ring numbers are no scan lines, by two sweeps: to look for the cones of each takes time."""

@@ -64,18 +64,15 @@ def _from_ros_1(type_name: str) -> Callable[[bytes], bytes]:
     return convert
 
 
-def _ros_1() -> dict[tuple[str, str], Translation]:
-    return {("ros1", "livox_ros_driver/CustomMsg"): _LIVOX, ("ros1", "livox_ros_driver2/CustomMsg"): _LIVOX} | _own()
-
-
 _LIVOX: Final = Translation(
     messages.POINT_CLOUD, lambda data: messages.serialized(point_clouds.cloud_of_ros_1(data), messages.POINT_CLOUD)
 )
 
 
-def _own() -> dict[tuple[str, str], Translation]:
+def _ros_1() -> dict[tuple[str, str], Translation]:
     known = {name: name for name in messages.known_types() if "/msg/" in name} | {"tf/msg/tfMessage": messages.TF}
-    return {
+    livox = {("ros1", "livox_ros_driver/CustomMsg"): _LIVOX, ("ros1", "livox_ros_driver2/CustomMsg"): _LIVOX}
+    return livox | {
         ("ros1", name.replace("/msg/", "/")): Translation(of_ros_2, _from_ros_1(of_ros_2))
         for name, of_ros_2 in known.items()
     }

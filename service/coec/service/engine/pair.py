@@ -176,7 +176,9 @@ class Pair:
                     messages.SubmitSolve(messages.WindowSubject(event.window_id, event.live), event.path)
                 )
             case WindowLost():
-                self._on_lost(event.window_id)
+                request = self._schedule.unanswered_about(messages.WindowSubject(event.window_id))
+                if request is not None:
+                    self._answer(request, _NOT_RECORDED)
             case messages.Tick():
                 self._tick(event)
             case messages.Reconfigured():
@@ -296,11 +298,6 @@ class Pair:
             self._answer(request, outcome)
         else:
             self._apply(self._conclude_window(None, subject, outcome))
-
-    def _on_lost(self, window_id: str) -> None:
-        request = self._schedule.unanswered_about(messages.WindowSubject(window_id))
-        if request is not None:
-            self._answer(request, _NOT_RECORDED)
 
     def _answer(self, request: messages.PairRequest, result: messages.PairResult) -> None:
         """A result has come: concludes all whose turn it is. A second result of a request is ignored."""
