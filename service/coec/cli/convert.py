@@ -16,7 +16,7 @@ from coec.errors import OutputError, UsageError
 from coec.reports import console
 
 if TYPE_CHECKING:
-    from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
+    from coec.calibration.types import CameraFrame, Frame, Matrix4, Rig
     from coec.config import CalibrationConfig, PairConfig, SweepConfig, WindowConfig
     from coec.io.recordings.layouts import RecordingSource
 
@@ -141,7 +141,7 @@ def _calibration(camera: CameraFrame) -> CalibrationConfig:
     return CalibrationConfig() if camera.depth is None else CalibrationConfig(depth=DepthConfig(model=STEREO))
 
 
-def first_frames(recording: RecordingSource) -> list[CameraFrame | LidarFrame | EgoMotion]:
+def first_frames(recording: RecordingSource) -> list[Frame]:
     """The first camera frame, and the frames that are needed to pair it."""
     return list(recording.messages([0]))
 

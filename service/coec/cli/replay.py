@@ -16,8 +16,9 @@ from coec.reports.console import StageTimes
 from coec.reports.formatting import count
 
 if TYPE_CHECKING:
+    from coec.calibration.types import Frame
     from coec.config import Config
-    from coec.io.recordings.recording_source import RecordingSource, SensorMessage
+    from coec.io.recordings.recording_source import RecordingSource
     from coec.service.drive_replay import Difference, ReplayedDrive
 
 NS_PER_S = 1_000_000_000
@@ -188,7 +189,7 @@ def _replay_drive(recording: RecordingSource, config: Config, begin_s: float, un
     if begin_ns > min(end_ns, recording.camera_stamps_ns[-1]):
         raise UsageError(f"no camera frame lies between --from and --until: {recording.name} is shorter")
 
-    def frames() -> Iterator[SensorMessage]:
+    def frames() -> Iterator[Frame]:
         # Motion before the first image and after the last one belongs to them.
         for frame in recording.messages():
             if until_s is not None and frame.stamp_ns > end_ns:

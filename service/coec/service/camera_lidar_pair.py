@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 
 from coec.calibration.frames.window import SliceClosed
+from coec.calibration.types import Frame
 from coec.config import CalibrationConfig, Config, PairConfig
 from coec.io.logs import LossCounter
 from coec.io.msgpack_frames import encode_camera
@@ -20,7 +21,7 @@ from coec.service.engine.frame_selector import FrameSelector
 from coec.service.engine.pair import Pair
 from coec.service.engine.pair_stream import PairStream
 from coec.service.engine.schedule import Request, Schedule
-from coec.service.ingest.decoder import Frame, SensorStream
+from coec.service.ingest.decoder import SensorStream
 from coec.service.ingest.frame_buffers import FrameRing
 from coec.service.recording.recorder import RecordBetween, Recorder, RecordingPlan, RecordPair, WindowRecorded
 from coec.service.recording.snippets import SnippetRecorder

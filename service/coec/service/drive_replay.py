@@ -25,7 +25,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, cast
 
 from coec.calibration.frames.window import SliceClosed
-from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
+from coec.calibration.types import CameraFrame, EgoMotion, Frame, LidarFrame
 from coec.config import BudgetConfig, Config, PairConfig
 from coec.errors import SourceError, UsageError
 from coec.io.disk_writer import DiskWriter
@@ -228,8 +228,6 @@ STOP_S = 5.0
 
 MOST_CORES = 64.0
 """Budget of a replay: what work costs does not decide what is checked."""
-
-Frame = CameraFrame | LidarFrame | EgoMotion
 
 
 class DriveClock(Clock):

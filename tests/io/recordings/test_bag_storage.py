@@ -14,10 +14,9 @@ from mcap.writer import CompressionType
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from ruamel.yaml import YAML
 
-from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
+from coec.calibration.types import CameraFrame, EgoMotion, Frame, LidarFrame
 from coec.errors import SourceError, WindowError
 from coec.io.recordings.layouts import open_source
-from coec.io.recordings.recording_source import SensorMessage
 from support.recordings import STORE, Bag, compressed_image_message, drive_messages
 
 SQLITE, MCAP = StoragePlugin.SQLITE3, StoragePlugin.MCAP
@@ -44,7 +43,7 @@ def a_folder(
     return path
 
 
-def reported(message: SensorMessage) -> tuple[object, ...]:
+def reported(message: Frame) -> tuple[object, ...]:
     match message:
         case CameraFrame():
             return message.stamp_ns, message.image.data

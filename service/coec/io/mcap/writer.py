@@ -28,12 +28,12 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
 from coec import __version__
-from coec.calibration.types import Matrix4, Rig
+from coec.calibration.types import Frame, Matrix4, Rig
 from coec.errors import RecordingError, WindowError
 from coec.io import storage
 from coec.io.mcap.reader import MAGIC, Channel, McapDamagedError, McapMessage, Metadata, Schema, read_records
 from coec.io.ros import messages
-from coec.io.ros.topics import Frame, FrameTopics, PairTopics, TopicMessage, qos_of
+from coec.io.ros.topics import FrameTopics, PairTopics, TopicMessage, qos_of
 
 PROFILE = "ros2"
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from coec.calibration.frames.lidar_origin import NO_SCAN_LINES, ApparentOrigin, SeveralOrigins, from_origin
-from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Recognition, Rig
+from coec.calibration.types import CameraFrame, EgoMotion, Frame, FramePair, LidarFrame, Matrix4, Recognition, Rig
 from coec.config import CalibrationConfig
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.io.mcap.windows import is_window, read_window
@@ -222,7 +222,7 @@ class BagRecording:
         """See `Recording`."""
         return tuple(motion.stamp_ns for motion in self.streams.motions)
 
-    def messages(self, cameras: Collection[int] | None = None) -> Iterator[recording_source.SensorMessage]:
+    def messages(self, cameras: Collection[int] | None = None) -> Iterator[Frame]:
         """See `Recording.messages`. With chosen camera frames, only the sweep nearest to each of them comes."""
         selected = [
             self.streams.camera[index] for index in recording_source.selected_indices(cameras, len(self.streams.camera))
@@ -381,7 +381,7 @@ def _frames(text: str | None) -> tuple[str, str]:
 
 def _load(
     storage: BagStorage, reader: BagReader, place: bag_index.MessageLocation, clouds: bag_index.CloudDecoder
-) -> recording_source.SensorMessage:
+) -> Frame:
     data = reader.read(place.at)
     try:
         return clouds.decode(place.type_name, data)

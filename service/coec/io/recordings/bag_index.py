@@ -19,7 +19,7 @@ from typing import Final, TypeVar
 import numpy as np
 from pydantic import ValidationError
 
-from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Recognition
+from coec.calibration.types import EgoMotion, Frame, Matrix4, Recognition
 from coec.config import LimitsConfig, PointTimeConfig, describe
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.io.recordings.bag_storage import MAX_MESSAGE_BYTES, BagMessage, BagReader, BagStorage
@@ -68,7 +68,7 @@ class CloudDecoder:
         except ValueError:
             raise UsageError(f"lidar_source={source}: it is a whole number, as in the points' field") from None
 
-    def decode(self, type_name: str, data: bytes) -> CameraFrame | LidarFrame | EgoMotion:
+    def decode(self, type_name: str, data: bytes) -> Frame:
         """The frame in a message of this type.
 
         Raises:

@@ -18,7 +18,7 @@ from rosbags.typesys.stores import ros2_humble as ros
 from rosbags.typesys.stores.ros2_humble import sensor_msgs__msg__CompressedImage as CompressedImage
 from rosbags.typesys.stores.ros2_humble import sensor_msgs__msg__Image as Image
 
-from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame
+from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, Frame, ImageFormat, LidarFrame
 from coec.config import LimitsConfig, PointTimeConfig
 from coec.errors import DecodeError
 from coec.io import images
@@ -352,7 +352,7 @@ def decode(
     *,
     point_time: PointTimeConfig | None = None,
     source: int | None = None,
-) -> CameraFrame | LidarFrame | EgoMotion:
+) -> Frame:
     """The frame in a message of one of the types in `KNOWN`.
 
     Stamp and frame id are those of the header, except for an odometry, whose frame id is that of the child frame, in

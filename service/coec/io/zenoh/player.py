@@ -15,7 +15,7 @@ from typing import Final, Literal, Protocol, TypeVar
 import zenoh
 from pydantic import TypeAdapter, ValidationError
 
-from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
+from coec.calibration.types import CameraFrame, EgoMotion, Frame, LidarFrame
 from coec.config import OpenPairConfig, TopicName
 from coec.errors import UsageError
 from coec.io import msgpack_frames
@@ -107,8 +107,6 @@ def repeated(
 
 
 CAMERA, LIDAR, EGO = "camera", "lidar", "ego"
-
-Frame = CameraFrame | LidarFrame | EgoMotion
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from coec.calibration.frames import lidar_origin
-from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
+from coec.calibration.types import CameraFrame, EgoMotion, Frame, LidarFrame
 from coec.config import (
     IDENTITY,
     AnyStreamConfig,
@@ -305,8 +305,6 @@ sensor's."""
 OTHERS = frozenset({"frame_id", "image_size"})
 """Causes of the refusal of frames that are another sensor's, or of a sensor with other settings."""
 
-Frame = CameraFrame | LidarFrame | EgoMotion
-
 
 @dataclass(frozen=True, slots=True)
 class StreamCounts:
@@ -558,8 +556,6 @@ def _check_camera(frame: CameraFrame, camera: CameraConfig) -> None:
         raise DecodeError("image_size", "differs from the size in the intrinsics")
 
 
-LoggedFrame = CameraFrame | LidarFrame | EgoMotion
-
 RATE_FRAMES = 30
 """The rate is measured over the first so many frames."""
 
@@ -584,7 +580,7 @@ class StreamLog:
         self._reported_s = -QUIET_S
         self._silent_since_s: float | None = None
 
-    def push(self, frame: LoggedFrame) -> None:
+    def push(self, frame: Frame) -> None:
         """A frame was accepted."""
         self._latest_s = self._clock()
         self._frames += 1
@@ -610,7 +606,7 @@ class StreamLog:
             _log.warning(text, extra={"fields": self._fields})
 
 
-def _shape(frame: LoggedFrame) -> str:
+def _shape(frame: Frame) -> str:
     match frame:
         case CameraFrame():
             return f"{frame.image.width}×{frame.image.height}, frame {frame.frame_id!r}"
