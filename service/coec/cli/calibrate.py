@@ -21,25 +21,30 @@ if TYPE_CHECKING:
     from coec.recording import Solution
 
 
+OutputFolder = Annotated[
+    Path | None,
+    typer.Option(
+        "--output",
+        help="Write report.html, overlay_before.png, overlay_after.png, close_ups.png, residuals.png and "
+        "result.json; with --camera-model also lens_residual.png, even if the model is refused.",
+        metavar="DIR",
+    ),
+]
+ShowIntrinsics = Annotated[
+    bool,
+    typer.Option(
+        "--intrinsics",
+        help="Also show focal length, principal point and radial distortion as the window has them, with σ. In "
+        "JSON they are always there (`lens`).",
+    ),
+]
+
+
 @with_calibration_options(CalibrationOptions)
 def calibrate(
     source: Source,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            help="Write report.html, overlay_before.png, overlay_after.png, close_ups.png, residuals.png and "
-            "result.json; with --camera-model also lens_residual.png, even if the model is refused.",
-            metavar="DIR",
-        ),
-    ] = None,
-    intrinsics: Annotated[
-        bool,
-        typer.Option(
-            "--intrinsics",
-            help="Also show focal length, principal point and radial distortion as the window has them, with σ. In "
-            "JSON they are always there (`lens`).",
-        ),
-    ] = False,
+    output: OutputFolder = None,
+    intrinsics: ShowIntrinsics = False,
     as_json: Json = False,
     fix: Fix = False,
     **options: Unpack[CalibrationOptions],

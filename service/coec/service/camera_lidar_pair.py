@@ -10,7 +10,7 @@ from coec.calibration.frames.window import SliceClosed
 from coec.calibration.types import Frame
 from coec.config import CalibrationConfig, Config, PairConfig
 from coec.io.logs import LossCounter
-from coec.io.msgpack_frames import encode_camera
+from coec.io.msgpack_frames import encode
 from coec.io.rig_files import rig_of
 from coec.service.api.command_execution import Commands
 from coec.service.api.pair_answers import PairAnswers
@@ -196,7 +196,7 @@ class CameraLidarPair:
                 case messages.Publish():
                     self.answers.on_update(action.snapshot)
                 case messages.Prefetch():
-                    self._context.worker.prefetch(self.name, encode_camera(action.camera))
+                    self._context.worker.prefetch(self.name, encode(action.camera))
                 case _:
                     self._context.worker.submit(self._job(action))
                     if isinstance(action, messages.SubmitCheck):

@@ -25,12 +25,13 @@ from tempfile import TemporaryDirectory
 from typing import Any, cast
 
 from coec.calibration.frames.window import SliceClosed
-from coec.calibration.types import CameraFrame, EgoMotion, Frame, LidarFrame
+from coec.calibration.types import Frame
 from coec.config import BudgetConfig, Config, PairConfig
 from coec.errors import SourceError, UsageError
 from coec.io.disk_writer import DiskWriter
-from coec.io.msgpack_frames import encode_camera, encode_ego, encode_lidar
+from coec.io.msgpack_frames import encode
 from coec.io.zenoh.bus import MSGPACK, InputSample
+from coec.io.zenoh.player import stream_of
 from coec.io.zenoh.ros_node import RosTopicList
 from coec.reports.formatting import count
 from coec.reports.page import Facts, Page, Section, Table, Text, write
@@ -40,7 +41,6 @@ from coec.service.cpu_budget import Budget
 from coec.service.engine import messages
 from coec.service.engine.rig import RigEstimator
 from coec.service.engine.vehicle import Vehicle
-from coec.service.ingest.decoder import CAMERA, EGO, LIDAR
 from coec.service.process_lifetime import joined
 from coec.service.recording.recorder import RecordBetween, RecordingThread, RecordPair
 from coec.service.recording.window_store import WindowStore
@@ -432,10 +432,9 @@ class DriveReplay:
             started_s = time.monotonic()
             for frame in frames:
                 self._clock.stamp_ns = max(self._clock.stamp_ns, frame.stamp_ns)
-                stream, payload = _packed(frame)
-                sensor = self._pair.sensors.get(stream)
+                sensor = self._pair.sensors.get(stream_of(frame))
                 if sensor is not None:
-                    self._vehicle.inbox.put(sensor.number, InputSample(payload, MSGPACK))
+                    self._vehicle.inbox.put(sensor.number, InputSample(encode(frame), MSGPACK))
                 self._settle()
                 on_frame(frame.stamp_ns)
             end_ns, health = self._clock.stamp_ns, self._pair.engine.store.state.health.value
@@ -492,17 +491,6 @@ class DriveReplay:
 
     def _deliver_oldest(self, request: messages.PairRequest) -> None:
         self._vehicle.deliver(request.subject if isinstance(request.subject, messages.WindowSubject) else request)
-
-
-def _packed(frame: Frame) -> tuple[str, bytes]:
-    """The stream of a frame, and its native encoding."""
-    match frame:
-        case CameraFrame():
-            return CAMERA, encode_camera(frame)
-        case LidarFrame():
-            return LIDAR, encode_lidar(frame)
-        case EgoMotion():
-            return EGO, encode_ego(frame)
 
 
 def _event_text(event: messages.Event) -> str:

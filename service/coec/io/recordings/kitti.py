@@ -200,6 +200,22 @@ def load_camera(stamp_ns: int, frame_id: str, image: Path, depth: Path | None) -
     return CameraFrame(stamp_ns, frame_id, load_image(image), depth=None if depth is None else load_image(depth))
 
 
+def _indices(images: dict[int, Path], clouds: dict[int, Path], none: str) -> list[int]:
+    """The numbers of frames with an image and a scan, in order. Raises SourceError with the text `none` if there are
+    none."""
+    indices = sorted(images.keys() & clouds.keys())
+    if not indices:
+        raise SourceError(none)
+    return indices
+
+
+def _frame(stamp_ns: int, camera: str, image: Path, cloud: Path, depth: Path | None = None) -> RecordedFrame:
+    """An image and the scan with its number. The scan carries the stamp of the camera, which it triggers."""
+    load_picture = partial(load_camera, stamp_ns, camera, image, depth)
+    load_scan = partial(load_cloud, stamp_ns, LIDAR_FRAME, cloud, CloudLayout(XYZI))
+    return RecordedFrame(stamp_ns, load_picture, stamp_ns, load_scan)
+
+
 CAMERAS = ("image_00", "image_01", "image_02", "image_03")
 LIDAR_FRAME = "velodyne"
 EGO_FRAME = "imu"
@@ -235,19 +251,9 @@ def open_kitti_raw(spec: SourceSpec) -> FramewiseRecording:
         raise SourceError(f"KITTI raw has no camera {camera}; there are {', '.join(CAMERAS)}")
     images = numbered_files(drive / camera / "data", ".png")
     clouds = numbered_files(drive / "velodyne_points" / "data", ".bin")
-    indices = sorted(images.keys() & clouds.keys())
-    if not indices:
-        raise SourceError(f"{drive}: no frame has both an image of {camera} and a Velodyne scan")
+    indices = _indices(images, clouds, f"{drive}: no frame has both an image of {camera} and a Velodyne scan")
     stamps_ns = _stamps(drive / camera / "timestamps.txt", indices[-1])
-    frames = [
-        RecordedFrame(
-            stamps_ns[index],
-            partial(load_camera, stamps_ns[index], camera, images[index], None),
-            stamps_ns[index],
-            partial(load_cloud, stamps_ns[index], LIDAR_FRAME, clouds[index], CloudLayout(XYZI)),
-        )
-        for index in indices
-    ]
+    frames = tuple(_frame(stamps_ns[index], camera, images[index], clouds[index]) for index in indices)
     image = load_image(images[indices[0]])
     T_camera_lidar, model = _calibration(calibration, camera.removeprefix("image_"), image.width, image.height)
     rig = Rig(
@@ -260,7 +266,7 @@ def open_kitti_raw(spec: SourceSpec) -> FramewiseRecording:
         sweep=SweepTiming(median_period_s(stamps_ns, 0.1), sign=-1, stamp_azimuth_rad=0.0),
     )
     name = f"kitti-raw/{drive.name}/{camera}"
-    return FramewiseRecording(name, rig, T_camera_lidar, tuple(frames), _motions(drive / "oxts", stamps_ns))
+    return FramewiseRecording(name, rig, T_camera_lidar, frames, _motions(drive / "oxts", stamps_ns))
 
 
 def _locate(root: Path, requested: str | None) -> tuple[Path, Path]:
@@ -372,9 +378,7 @@ def open_kitti_odometry(spec: SourceSpec) -> FramewiseRecording:
     camera = select_one(there, query.get("camera", "image_2" if "image_2" in there else None), "camera", folder)
     images = numbered_files(folder / camera, ".png") or numbered_files(folder / camera, ".jpg")
     clouds = numbered_files(folder / "velodyne", ".bin")
-    indices = sorted(images.keys() & clouds.keys())
-    if not indices:
-        raise SourceError(f"{folder}: no frame has both an image of {camera} and a Velodyne scan")
+    indices = _indices(images, clouds, f"{folder}: no frame has both an image of {camera} and a Velodyne scan")
     stamps_ns = _odometry_stamps(folder / "times.txt", indices[-1])
     image, path = load_image(images[indices[0]]), folder / "calib.txt"
     numbers = read_numbers(path)
@@ -395,17 +399,9 @@ def open_kitti_odometry(spec: SourceSpec) -> FramewiseRecording:
         T_camera_lidar_nominal=T_camera_lidar,
         T_lidar_ego=np.eye(4),
     )
-    frames = [
-        RecordedFrame(
-            stamps_ns[index],
-            partial(load_camera, stamps_ns[index], camera, images[index], None),
-            stamps_ns[index],
-            partial(load_cloud, stamps_ns[index], LIDAR_FRAME, clouds[index], CloudLayout(XYZI)),
-        )
-        for index in indices
-    ]
+    frames = tuple(_frame(stamps_ns[index], camera, images[index], clouds[index]) for index in indices)
     name = f"kitti-odometry/{folder.resolve().name}/{camera}"
-    return FramewiseRecording(name, rig, T_camera_lidar, tuple(frames), recognitions=(COMPENSATED,))
+    return FramewiseRecording(name, rig, T_camera_lidar, frames, recognitions=(COMPENSATED,))
 
 
 def _odometry_stamps(path: Path, last: int) -> list[int]:
@@ -458,23 +454,14 @@ def open_kitti360(spec: SourceSpec) -> FramewiseRecording:
     images = numbered_files(images_root / drive / camera / ("data_rect" if rectified else "data_rgb"), ".png")
     velodyne = root / "data_3d_raw" / drive / "velodyne_points"
     clouds = numbered_files(velodyne / "data", ".bin")
-    indices = sorted(images.keys() & clouds.keys())
-    if not indices:
-        raise SourceError(f"{root}: no frame of {drive} has both an image of {camera} and a Velodyne scan")
+    indices = _indices(images, clouds, f"{root}: no frame of {drive} has both an image of {camera} and a Velodyne scan")
     stamps_path = _stamps_path(images_root / drive, camera, velodyne)
     stamps_ns = read_stamps(stamps_path)
     depths = _depth_maps(root, camera, query.get("depth"))
-    frames = []
-    for index in indices:
-        stamp_ns = stamp_of(stamps_ns, index, stamps_path)
-        frames.append(
-            RecordedFrame(
-                stamp_ns,
-                partial(load_camera, stamp_ns, camera, images[index], depths.get(index)),
-                stamp_ns,
-                partial(load_cloud, stamp_ns, LIDAR_FRAME, clouds[index], CloudLayout(XYZI)),
-            )
-        )
+    frames = tuple(
+        _frame(stamp_of(stamps_ns, index, stamps_path), camera, images[index], clouds[index], depths.get(index))
+        for index in indices
+    )
     calibration = root / "calibration"
     T_pose_cam, T_velo_cam0 = _camera_poses(calibration), _velo_from_cam0(calibration)
     T_lidar_pose = T_velo_cam0 @ se3.inverse(T_pose_cam["image_00"])
@@ -495,7 +482,7 @@ def open_kitti360(spec: SourceSpec) -> FramewiseRecording:
         sweep=SweepTiming(median_period_s(stamps_ns, NOMINAL_PERIOD_S), sign=-1, stamp_azimuth_rad=0.0),
     )
     motions = _pose_motions(root / "data_poses" / drive / "poses.txt", indices, stamps_ns, rigid(T_lidar_pose))
-    return FramewiseRecording(f"kitti360/{drive}/{camera}", rig, T_camera_lidar, tuple(frames), motions)
+    return FramewiseRecording(f"kitti360/{drive}/{camera}", rig, T_camera_lidar, frames, motions)
 
 
 def _stamps_path(images: Path, camera: str, velodyne: Path) -> Path:

@@ -11,18 +11,7 @@ from coec.errors import UsageError
 from coec.io.exported_extrinsic import ExportFrames
 from coec.io.exports import NAMES
 from coec.io.zenoh.bus import Answer, Bus, QueryLane, Request, Route
-from coec.schemas.keys import (
-    LAST,
-    RIG,
-    Format,
-    Keys,
-    parse_evidence_selector,
-    parse_extrinsic_selector,
-    parse_history_selector,
-    parse_overlay_selector,
-    parse_range_selector,
-    parse_selector,
-)
+from coec.schemas import keys as bus_keys
 from coec.service.api import metrics as metrics_text
 from coec.service.api.authorization import CommandHandler
 from coec.service.api.pair_answers import PairAnswers, PendingPairAnswers
@@ -48,7 +37,7 @@ class VehicleRoutes:
 
     def __init__(
         self,
-        keys: Keys,
+        keys: bus_keys.Keys,
         pairs: Mapping[str, AnyPairAnswers],
         command_handler: CommandHandler,
         status: Callable[[], SerializedReply],
@@ -146,14 +135,16 @@ class VehicleRoutes:
         address = self._keys.parse(key)
         if address.resource != "command":
             raise UsageError("the rig takes commands; the estimate of the whole rig is at `rig`")
-        command = Route(key, partial(self._command_handler.handle, RIG, str(address.argument)), QueryLane.COMMANDS)
+        command = Route(
+            key, partial(self._command_handler.handle, bus_keys.RIG, str(address.argument)), QueryLane.COMMANDS
+        )
         return [self._timed(command, "command")]
 
     def _find_last(self, pair: str) -> Callable[[str], Sequence[Route]]:
         """A function that finds the route for the last word of a pair, for queries of that word or of all last words.
         It finds none for queries of something else about a pair that happens to be called `last`."""
-        route = self._timed(Route(self._keys.last(pair), partial(self._last, pair), QueryLane.AT_ONCE), LAST)
-        return lambda key: [route] if key.split("/")[-2] == LAST else []
+        route = self._timed(Route(self._keys.last(pair), partial(self._last, pair), QueryLane.AT_ONCE), bus_keys.LAST)
+        return lambda key: [route] if key.split("/")[-2] == bus_keys.LAST else []
 
     def _last(self, pair: str, request: Request) -> Answer:
         return self._heartbeats.answer(pair, _format(request))
@@ -165,7 +156,7 @@ class VehicleRoutes:
             UsageError: the key names no pair of this vehicle.
         """
         pair = key.removeprefix(f"{self._keys.root}/").partition("/")[0]
-        if _has_wildcard(key) or key in self._vehicle_routes or pair in (*self._pairs, RIG, LAST):
+        if _has_wildcard(key) or key in self._vehicle_routes or pair in (*self._pairs, bus_keys.RIG, bus_keys.LAST):
             return []
         raise UsageError(f"no such pair or resource; pairs served here: {', '.join(self._pairs)}")
 
@@ -188,14 +179,14 @@ class VehicleRoutes:
 
     def _window(self, pair: AnyPairAnswers, window_id: str) -> Callable[[Request], Answer]:
         def answer(request: Request) -> Answer:
-            selector = parse_range_selector(request.parameters)
+            selector = bus_keys.parse_range_selector(request.parameters)
             return Answer(pair.calibrated.read_window(window_id, selector.offset, selector.length), OCTETS)
 
         return answer
 
     def _evidence(self, pair: AnyPairAnswers, event_id: str) -> Callable[[Request], Answer]:
         def answer(request: Request) -> Answer:
-            selector = parse_evidence_selector(request.parameters)
+            selector = bus_keys.parse_evidence_selector(request.parameters)
             if selector.overlay is not None:
                 return Answer(pair.calibrated.event_overlay(event_id, selector.overlay), JPEG)
             return answer_of(pair.calibrated.event(event_id), selector.format)
@@ -204,19 +195,19 @@ class VehicleRoutes:
 
 
 def _extrinsic(pair: AnyPairAnswers, request: Request) -> Answer:
-    selector = parse_extrinsic_selector(request.parameters, NAMES)
+    selector = bus_keys.parse_extrinsic_selector(request.parameters, NAMES)
     if selector.export is None:
         return pair.calibrated.extrinsic(selector.format)
     return pair.calibrated.exported(selector.export, ExportFrames(selector.parent, selector.child))
 
 
 def _overlay(pair: AnyPairAnswers, request: Request) -> Answer:
-    selector = parse_overlay_selector(request.parameters)
+    selector = bus_keys.parse_overlay_selector(request.parameters)
     return Answer(pair.calibrated.overlay(selector.window_id, nominal=selector.at == "nominal"), JPEG)
 
 
 def _history(pair: AnyPairAnswers, request: Request) -> Answer:
-    selector = parse_history_selector(request.parameters)
+    selector = bus_keys.parse_history_selector(request.parameters)
     return answer_of(pair.calibrated.history(selector.since_ns, selector.until_ns, selector.limit), selector.format)
 
 
@@ -225,8 +216,8 @@ def _evidence_list(pair: AnyPairAnswers, request: Request) -> Answer:
     return answer_of(pair.calibrated.events(), form)
 
 
-def _format(request: Request) -> Format:
-    return parse_selector(request.parameters).format
+def _format(request: Request) -> bus_keys.Format:
+    return bus_keys.parse_selector(request.parameters).format
 
 
 def _always(route: Route) -> Callable[[str], Sequence[Route]]:

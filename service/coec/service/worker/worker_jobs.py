@@ -36,7 +36,7 @@ from coec.config import CalibrationConfig, LimitsConfig
 from coec.geometry import se3
 from coec.io.converter import MalformedValueError, make_converter, structured
 from coec.io.converter import register as register_form
-from coec.io.msgpack_frames import decode_camera, decode_ego, decode_lidar, encode_camera, encode_ego, encode_lidar
+from coec.io.msgpack_frames import decode_camera, decode_ego, decode_lidar, encode
 from coec.schemas.message import from_msgpack, to_msgpack
 
 if TYPE_CHECKING:
@@ -69,10 +69,10 @@ class _PackedLazily(Sequence[list[bytes | None]]):
         if isinstance(index, slice):
             return _PackedLazily(self._pairs[index])
         pair = self._pairs[index]
-        motion = encode_ego(pair.motion) if pair.motion else None
+        motion = encode(pair.motion) if pair.motion else None
         if isinstance(pair, FramePair):
-            return [encode_camera(pair.camera), encode_lidar(pair.lidar), motion]
-        return [encode_lidar(pair.a), encode_lidar(pair.b), motion]
+            return [encode(pair.camera), encode(pair.lidar), motion]
+        return [encode(pair.a), encode(pair.b), motion]
 
 
 def unpack_pairs(frames: Sequence[Sequence[bytes | None]], limits: LimitsConfig) -> tuple[FramePair, ...]:
