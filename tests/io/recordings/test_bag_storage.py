@@ -218,7 +218,6 @@ def test_a_bag_that_grows_without_end_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: CompressionMode
 ) -> None:
     monkeypatch.setattr("coec.io.recordings.bag_storage.MAX_RATIO", 2)
-    monkeypatch.setattr("coec.io.recordings.bag_storage.MAX_RATIO", 2)
     monkeypatch.setattr("coec.io.recordings.bag_storage.MAX_UNPACKED_MESSAGE_BYTES", 30_000)
     monkeypatch.setattr("coec.io.recordings.bag_storage.MAX_CHUNK_BYTES", 30_000)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))

@@ -33,6 +33,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from coec.config import describe, load_yaml
 from coec.errors import ConfigError, DecodeError, SourceError
 from coec.io.mcap import reader as mcap_reader
+from coec.io.mcap.reader import MAX_CHUNK_BYTES, MAX_RATIO
 from coec.io.mcap.windows import is_window
 from coec.io.recordings.recording_source import BAG_SUFFIXES
 from coec.io.ros import message_decoding, messages
@@ -110,7 +111,7 @@ class McapStorage:
         channels: dict[int, mcap_reader.Channel] = {}
         try:
             with self.path.open("rb") as stream:
-                limit = mcap_reader.MAX_CHUNK_BYTES + mcap_reader.MAX_RATIO * self.path.stat().st_size
+                limit = MAX_CHUNK_BYTES + MAX_RATIO * self.path.stat().st_size
                 for record in mcap_reader.read_records(stream, max_unpacked_bytes=limit):
                     match record:
                         case mcap_reader.Schema():
@@ -329,7 +330,7 @@ def _records(data: bytes, begin: int) -> Iterator[_Record]:
     at = 0
     while at < len(data):
         header, at = _span(data, at, begin, MAX_HEADER_BYTES)
-        body, end = _span(data, at, begin, mcap_reader.MAX_CHUNK_BYTES)
+        body, end = _span(data, at, begin, MAX_CHUNK_BYTES)
         yield _Record(_fields(header, begin + at), body, at + _LENGTH.size)
         at = end
 
@@ -369,7 +370,7 @@ class Ros1Storage:
         connections: dict[int, tuple[str, int]] = {}
         try:
             with self.path.open("rb") as stream:
-                left = mcap_reader.MAX_CHUNK_BYTES + mcap_reader.MAX_RATIO * self.path.stat().st_size
+                left = MAX_CHUNK_BYTES + MAX_RATIO * self.path.stat().st_size
                 for record, begin in _of_file(stream):
                     if record.operation != _CHUNK:
                         yield from self._entry(record, _NO_CHUNK, connections)
@@ -377,9 +378,7 @@ class Ros1Storage:
                     chunk = _unpacked(record)
                     left -= len(chunk)
                     if left < 0:
-                        raise ValueError(
-                            f"byte {record.at}: the file unpacks to more than {mcap_reader.MAX_RATIO} times its size"
-                        )
+                        raise ValueError(f"byte {record.at}: the file unpacks to more than {MAX_RATIO} times its size")
                     for inner in _records(chunk, record.at):
                         yield from self._entry(inner, begin, connections)
         except OSError as error:
@@ -437,7 +436,7 @@ def _next(stream: BinaryIO) -> _Record | None:
         return None
     header = _read(stream, length, MAX_HEADER_BYTES)
     at = stream.tell() + _LENGTH.size
-    return _Record(_fields(header, at), _read(stream, stream.read(_LENGTH.size), mcap_reader.MAX_CHUNK_BYTES), at)
+    return _Record(_fields(header, at), _read(stream, stream.read(_LENGTH.size), MAX_CHUNK_BYTES), at)
 
 
 def _read(stream: BinaryIO, length: bytes, most: int) -> bytes:
@@ -455,10 +454,8 @@ def _read(stream: BinaryIO, length: bytes, most: int) -> bytes:
 def _unpacked(record: _Record) -> bytes:
     """The records in a chunk."""
     size, compression = record.number(b"size"), record.fields.get(b"compression", b"none")
-    if size > mcap_reader.MAX_CHUNK_BYTES:
-        raise ValueError(
-            f"byte {record.at}: a chunk would unpack to {size} bytes, the limit is {mcap_reader.MAX_CHUNK_BYTES}"
-        )
+    if size > MAX_CHUNK_BYTES:
+        raise ValueError(f"byte {record.at}: a chunk would unpack to {size} bytes, the limit is {MAX_CHUNK_BYTES}")
     try:
         match compression:
             case b"none":
@@ -568,9 +565,9 @@ class FolderStorage:
             left = MAX_UNPACKED_MESSAGE_BYTES
             for entry in file.entries():
                 data = self.plain(entry.data)
-                left += mcap_reader.MAX_RATIO * len(entry.data) - len(data)
+                left += MAX_RATIO * len(entry.data) - len(data)
                 if left < 0:
-                    raise SourceError(f"{file.path} unpacks to more than {mcap_reader.MAX_RATIO} times its size")
+                    raise SourceError(f"{file.path} unpacks to more than {MAX_RATIO} times its size")
                 yield replace(entry, data=data, place=(number, *entry.place))
 
     @contextmanager
@@ -699,11 +696,11 @@ def _unpacked_file(file: Path, folder: Path) -> Path:
     unpacker = zstandard.ZstdDecompressor(max_window_size=mcap_reader.MAX_ZSTD_WINDOW)
     try:
         with file.open("rb") as packed, target.open("wb") as plain:
-            left = MAX_UNPACKED_MESSAGE_BYTES + mcap_reader.MAX_RATIO * file.stat().st_size
+            left = MAX_UNPACKED_MESSAGE_BYTES + MAX_RATIO * file.stat().st_size
             for block in unpacker.read_to_iter(packed, write_size=_COPY_BYTES):
                 left -= len(block)
                 if left < 0:
-                    raise SourceError(f"{file} unpacks to more than {mcap_reader.MAX_RATIO} times its size")
+                    raise SourceError(f"{file} unpacks to more than {MAX_RATIO} times its size")
                 if shutil.disk_usage(folder).free < MIN_FREE_BYTES:
                     raise SourceError(f"{file} unpacks to more than {folder.parent} has room for")
                 plain.write(block)
