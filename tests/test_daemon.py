@@ -23,7 +23,7 @@ from coec.config import (
     load_config,
 )
 from coec.errors import ExitCode, RemoteError
-from coec.io.mcap.window_reader import read_result, read_window
+from coec.io.mcap.windows import read_result, read_window
 from coec.io.msgpack_frames import encode_lidar
 from coec.io.zenoh.bus import MSGPACK
 from coec.reports.commented_yaml import commented_yaml

@@ -13,7 +13,7 @@ import pytest
 
 from coec.config import AuthorityConfig, load_yaml
 from coec.io.zenoh.command_auth import CommandListener, CommandSender, credentials_of
-from coec.io.zenoh.endpoints import credentials_in, read_settings
+from coec.io.zenoh.session import credentials_in, read_settings
 from conftest import REPOSITORY
 from deploy.written import stages
 from support.router import CERTIFICATE_NAMES, MAKE_TEST_CA, TestAuthority

@@ -35,8 +35,7 @@ from coec.errors import UsageError
 from coec.io.zenoh import query_client
 from coec.io.zenoh.bus import MSGPACK
 from coec.io.zenoh.command_auth import CommandSender
-from coec.io.zenoh.endpoints import credentials_in, read_settings
-from coec.io.zenoh.session import connected_of
+from coec.io.zenoh.session import connected_of, credentials_in, read_settings
 from coec.io.zenoh.subscriptions import PairUpdate, subscribed
 from coec.schemas.commands import COMMAND_NAMES, CommandName
 from coec.schemas.keys import Keys

@@ -20,9 +20,8 @@ from coec.io.serialise import reasons_of
 from coec.io.system import ServiceManagerNotifier, ServiceThread, resident_bytes
 from coec.io.zenoh.bus import Answer, Bus, open_session
 from coec.io.zenoh.command_auth import CommandListener, credentials_of
-from coec.io.zenoh.endpoints import redacted
 from coec.io.zenoh.ros_node import RosPublishers, RosSide
-from coec.io.zenoh.session import Reach, connected_of, mode_of, settings_of, unguarded
+from coec.io.zenoh.session import Reach, connected_of, mode_of, redacted, settings_of, unguarded
 from coec.io.zenoh.singleton import SingletonGuard, rival_text, unproven_text
 from coec.schemas import replies
 from coec.schemas.keys import Keys
@@ -324,12 +323,12 @@ class Daemon:
             ("tell", self._renew),
             ("take no more samples", self._bus.undeclare_inputs),
             ("look for no more pairs", lambda: stopped(self._pending_pairs.threads, LISTENER_STOP_S)),
-            ("end the engine", self._end_engine),
+            ("end the engine", lambda: _end(self._vehicle, ENGINE_STOP_S)),
             ("finish the open windows", self._finish_windows),
-            ("end the recorders", self._end_recording),
+            ("end the recorders", lambda: _end(self._recording, RECORDER_STOP_S)),
             ("end the worker", self._worker.request_stop),
             ("take the last outcomes", self._finish_pairs),
-            ("write all that is to be remembered", self._end_disk_writer),
+            ("write all that is to be remembered", lambda: _end(self._disk_writer, DISK_WRITER_STOP_S)),
             ("end the answers", lambda: stopped(self._bus.threads, QUERIES_STOP_S)),
             ("stop serving HTTP", lambda: self._metrics_server.close(HTTP_STOP_S)),
             ("stop publishing to ROS", lambda: self._ros_outputs.close(ROS_STOP_S)),
@@ -343,18 +342,6 @@ class Daemon:
         attempt("wait for the worker", lambda: joined([self._worker.thread], WORKER_STOP_S))
         _log.info("stopped", extra={"fields": {"session_closed": closed}})
         return bool(guard_closed and closed)
-
-    def _end_engine(self) -> None:
-        self._vehicle.request_stop()
-        joined([self._vehicle.thread], ENGINE_STOP_S)
-
-    def _end_recording(self) -> None:
-        self._recording.request_stop()
-        joined([self._recording.thread], RECORDER_STOP_S)
-
-    def _end_disk_writer(self) -> None:
-        self._disk_writer.request_stop()
-        joined([self._disk_writer.thread], DISK_WRITER_STOP_S)
 
     def _finish_windows(self) -> None:
         """Finishes the open windows if the engine has ended. While it runs, only its thread may touch them."""
@@ -554,6 +541,12 @@ class Daemon:
         memory = (resident_bytes(), self._worker.status().rss_bytes)
         view = MetricsInput(self._status_reply, self._health(), *memory, took, self._rig_answers.reply, self._uplink)
         return metrics.render(view, text_format)
+
+
+def _end(part: Vehicle | RecordingThread | DiskWriter, timeout_s: float) -> None:
+    """Ends a part with a thread of its own."""
+    part.request_stop()
+    joined([part.thread], timeout_s)
 
 
 def _snippets_of(config: Config) -> SnippetStore | None:

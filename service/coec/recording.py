@@ -39,8 +39,8 @@ from coec.io.recordings.window_cutting import LoadedWindow, NoPairsError
 from coec.io.rig_files import intrinsics_config
 from coec.io.serialise import matrix_of, mistake_of, result_of
 from coec.io.user_files import read_bytes
+from coec.reports.drawing import titled
 from coec.reports.formatting import count
-from coec.reports.overlay import titled
 from coec.reports.recording_fitness import Cadence, cadence
 from coec.schemas.message import to_json
 from coec.schemas.replies import CalibrationResult, Lens, MetricReply, Reason, Verdict

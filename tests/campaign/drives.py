@@ -13,7 +13,7 @@ from rosbags.highlevel import AnyReader
 
 from coec.calibration.types import Matrix4
 from coec.geometry.se3 import rotation_angle_rad, rotation_from_quaternion_xyzw
-from coec.io.mcap.bag_writer import write_bag
+from coec.io.mcap.writer import write_bag
 from coec.io.recordings.layouts import open_source
 from e2e.processes import coec
 

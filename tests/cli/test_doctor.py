@@ -29,8 +29,8 @@ from coec.config import CalibrationConfig, Config, LimitsConfig, MonitorConfig, 
 from coec.io import system
 from coec.io.msgpack_frames import encode_camera, encode_ego, encode_lidar
 from coec.io.zenoh.bus import MSGPACK, open_session
-from coec.io.zenoh.endpoints import CertificateError, Endpoint, TlsFiles, host_and_port, read_certificate, tls_files
 from coec.io.zenoh.ros_node import RosTopicList
+from coec.io.zenoh.session import CertificateError, Endpoint, TlsFiles, host_and_port, read_certificate, tls_files
 from coec.reports.commented_yaml import commented_yaml
 from coec.schemas.documents import Finding
 from conftest import REPOSITORY

@@ -20,10 +20,9 @@ from coec.cli import fetch as cli_fetch
 from coec.config import UplinkConfig, ZenohConfig
 from coec.errors import NotFoundError, RemoteError, UsageError
 from coec.io.images import encode_jpeg
-from coec.io.mcap.window_writer import WindowWriter, write_result
+from coec.io.mcap.windows import WindowWriter, write_result
 from coec.io.zenoh.bus import Answer
-from coec.io.zenoh.query_client import connected
-from coec.io.zenoh.window_fetch import PIECE_BYTES, SPARE_BYTES, NoSpaceError, RecordingInfo, fetch_window
+from coec.io.zenoh.query_client import PIECE_BYTES, SPARE_BYTES, NoSpaceError, RecordingInfo, connected, fetch_window
 from coec.schemas.documents import IncidentReport
 from coec.schemas.keys import Keys, parse_range_selector
 from coec.schemas.message import to_json

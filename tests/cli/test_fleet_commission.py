@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cli.conftest import Coec
-from coec.io.baseline_file import load_baseline, save_baseline
+from coec.io.rig_files import load_baseline, save_baseline
 from support.estimates import a_baseline
 
 

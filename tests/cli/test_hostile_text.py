@@ -21,7 +21,7 @@ from coec.errors import DecodeError, RemoteError
 from coec.io.zenoh.bus import JSON, MSGPACK
 from coec.io.zenoh.query_client import Reply, connected
 from coec.reports import console, fleet_board, replies
-from coec.schemas import fleet as fleet_now
+from coec.schemas import documents as fleet_now
 from coec.schemas import heartbeat, message, rig_state
 from coec.schemas.documents import Finding
 from coec.schemas.keys import Keys

@@ -18,7 +18,7 @@ from cli.conftest import SMALL, Coec
 from coec import api
 from coec.config import CalibrationConfig, DepthConfig, ObjectiveConfig
 from coec.errors import NotAcceptedError, OutputError, SourceError, UsageError
-from coec.io.mcap.window_writer import WindowWriter
+from coec.io.mcap.windows import WindowWriter
 from coec.schemas.message import to_json
 from coec.schemas.replies import CalibrationResult
 from coec_lab.experiments.evaluation_schema import EvaluationReport

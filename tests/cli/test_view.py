@@ -53,7 +53,7 @@ PATIENCE_S = 60.0
 def viewing(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Outcome]:
     """Runs `coec view ARGS --json`, and `look(url)` beside it as soon as it is served; then tells it to end. What is
     done every second or other is done more often."""
-    for name in ("view.vehicle.REPEAT_S", "view.vehicle.QUERY_S", "view.recording.AGAIN_S"):
+    for name in ("view.sources.REPEAT_S", "view.sources.QUERY_S", "view.sources.AGAIN_S"):
         monkeypatch.setattr(f"coec.cli.{name}", OFTEN_S)
 
     def run(observation: Callable[[str], None], *arguments: object) -> Outcome:

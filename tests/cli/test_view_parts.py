@@ -12,8 +12,8 @@ import pytest
 
 from cli.vehicle_on_screen import PAIR, RIG, configuration, extrinsic, health
 from coec.cli.view import ListenAddress, listen_address
-from coec.cli.view import vehicle as view_vehicle
-from coec.cli.view.vehicle import (
+from coec.cli.view import sources as view_vehicle
+from coec.cli.view.sources import (
     DEPTHS,
     SILENT_S,
     SensorStreams,

@@ -16,8 +16,7 @@ from coec.errors import SourceError
 from coec.geometry import se3
 from coec.io.depth.depth_maps import open_depth
 from coec.io.images import GreyImages
-from coec.io.mcap.window_reader import read_result, read_window
-from coec.io.mcap.window_writer import WindowWriter, write_result
+from coec.io.mcap.windows import WindowWriter, read_result, read_window, write_result
 from coec.io.recordings import window_cutting
 from coec.io.recordings.window_cutting import with_thinned_pairs
 from coec.io.serialise import result_of

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from coec.config import OpenPairConfig, poses
 from coec.config.model import ConfigModel, describe
-from coec.config.pose_forms import Pose, with_direction
+from coec.config.pair import Pose, with_direction
 from coec.geometry import se3
 
 XYZ = [0.1, -0.2, 0.3]

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from coec.io.mcap.window_writer import write_result
+from coec.io.mcap.windows import write_result
 from conftest import REPOSITORY
 from deploy.test_layout import panels_in, texts_in
 from support.readers import RecordingContents, read_recording

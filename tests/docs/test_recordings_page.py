@@ -3,10 +3,9 @@
 import re
 from pathlib import Path
 
-from coec.io.converted_images import DEEP_COLOURS, SEMIPLANAR
 from coec.io.recordings.bag import KEYS
 from coec.io.recordings.bag_recognition import READING_KEYS
-from coec.io.ros.message_decoding import ENCODINGS
+from coec.io.ros.message_decoding import DEEP_COLOURS, ENCODINGS, SEMIPLANAR
 from coec.io.ros.translations import _FOXGLOVE
 
 REPOSITORY = Path(__file__).parents[2]

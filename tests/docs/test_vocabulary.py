@@ -79,7 +79,7 @@ REFUSED = {
 
 WIRE = {
     "service/coec/config/root.py": {"awaited"},
-    "service/coec/schemas/fleet.py": {"kept", "looked_s", "said_s"},
+    "service/coec/schemas/documents.py": {"kept", "looked_s", "said_s"},
     "service/coec/schemas/heartbeat.py": {"said_ns"},
     "service/coec/schemas/replies.py": {"found", "independent_looks", "kept_for", "look_s", "wanted"},
     "service/coec/schemas/rig_state.py": {"looks"},

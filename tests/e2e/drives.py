@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coec.calibration.types import CameraFrame
+from coec.calibration.types import CameraFrame, Frame
 from coec.config import CalibrationConfig, DepthConfig, MonitorConfig, PolicyConfig, WindowConfig
 from coec.geometry.se3 import inverse, rotation_angle_rad
 from coec.io.recordings.recording_source import parse_spec
-from coec.io.zenoh.player import Frame
 from coec_lab.simulation.source import open_sim
 from e2e.processes import Router, write_configuration
 from support.simulated_drives import rendered_source

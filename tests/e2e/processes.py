@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import zenoh
 
+from coec.calibration.types import Frame
 from coec.cli.convert import configuration_for
 from coec.cli.main import main
 from coec.config import BudgetConfig, Config, LimitsConfig, StateConfig, ZenohConfig, load_config
@@ -30,7 +31,7 @@ from coec.geometry.se3 import Array, perturb
 from coec.io.recordings.layouts import RecordingSource
 from coec.io.rig_files import mask_to_png
 from coec.io.zenoh.bus import open_session
-from coec.io.zenoh.player import CAMERA, Frame, Played, Player, StreamKeys, stream_of
+from coec.io.zenoh.player import CAMERA, Played, Player, StreamKeys, stream_of
 from coec.io.zenoh.query_client import connected, query_one
 from coec.reports.commented_yaml import commented_yaml
 from coec.schemas.keys import Keys

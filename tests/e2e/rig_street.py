@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from multiprocessing import get_context
 
-from coec.calibration.types import Matrix4
-from coec.io.zenoh.player import Frame
+from coec.calibration.types import Frame, Matrix4
 from coec_lab.experiments.rig_drives import ROWS
 from coec_lab.simulation.drive import Arrival
 from coec_lab.simulation.faults import SensorFault, StepFault

@@ -17,10 +17,9 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.stores import ros2_humble as ros
 from zenoh.ext import AdvancedPublisher, CacheConfig, MissDetectionConfig, declare_advanced_publisher
 
-from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
+from coec.calibration.types import CameraFrame, EgoMotion, Frame, LidarFrame
 from coec.geometry import cameras
 from coec.io.ros import message_encoding
-from coec.io.zenoh.player import Frame
 from support.recordings import transform_message
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)

@@ -23,7 +23,7 @@ from coec.config import (
     WindowConfig,
     load_config,
 )
-from coec.io.mcap.window_reader import read_window
+from coec.io.mcap.windows import read_window
 from coec.io.zenoh.player import Player, StreamKeys, repeated, shifted
 from coec.io.zenoh.query_client import is_alive
 from coec.reports.commented_yaml import commented_yaml

@@ -19,8 +19,9 @@ import zenoh
 
 pytest.importorskip("embreex", reason="needs embreex")
 
+from coec.calibration.types import Frame
 from coec.geometry.se3 import inverse, rotation_angle_rad
-from coec.io.zenoh.player import Frame, Player, SensorKeys
+from coec.io.zenoh.player import Player, SensorKeys
 from coec.schemas.message import from_msgpack
 from coec.schemas.rig_state import RigCorrection, RigReply
 from coec_lab.commands.rig_play import document_of

@@ -12,6 +12,7 @@ import numpy as np
 import psutil
 import pytest
 
+from coec.calibration.types import Frame
 from coec.config import (
     CalibrationConfig,
     DepthConfig,
@@ -20,10 +21,8 @@ from coec.config import (
     WindowConfig,
     load_config,
 )
-from coec.io.mcap.bag_writer import write_bag
-from coec.io.zenoh.player import Frame
-from coec.service.decision_log import differences, read_log
-from coec.service.drive_replay import DriveReplay
+from coec.io.mcap.writer import write_bag
+from coec.service.drive_replay import DriveReplay, differences, read_log
 from e2e.drives import (
     NS_PER_S,
     SECONDS,

@@ -12,7 +12,7 @@ from rosbags.rosbag2 import StoragePlugin
 from ruamel.yaml import YAML
 
 from coec.config import CalibrationConfig, DepthConfig, WindowConfig
-from coec.io.mcap.bag_writer import write_bag
+from coec.io.mcap.writer import write_bag
 from coec.io.ros.topics import PairTopics
 from e2e.drives import STEPPED, Drive, rendered, without_depth
 from e2e.processes import Router, coec, service, write_configuration

@@ -13,8 +13,7 @@ from pydantic import BaseModel
 from coec.config import Config, DepthConfig, SnippetsConfig, UplinkConfig, load_config
 from coec.errors import RemoteError
 from coec.io.zenoh.command_auth import CommandSender, Credentials
-from coec.io.zenoh.query_client import JSON, Reply, query_one, send_authenticated
-from coec.io.zenoh.window_fetch import fetch_window
+from coec.io.zenoh.query_client import JSON, Reply, fetch_window, query_one, send_authenticated
 from coec.reports.commented_yaml import commented_yaml
 from e2e.drives import (
     EARLY_SECONDS,

@@ -12,11 +12,11 @@ from pathlib import Path
 import psutil
 import pytest
 
+from coec.fleet.engines import LocalEngine
 from coec.fleet.evaluator import ReplaySettings
 from coec.fleet.jobs import Job
-from coec.fleet.local_engine import LocalEngine
 from coec.fleet.worker_pool import DEADLINE, PROCESS_DIED, TOO_LARGE, Engine, WorkerLimits
-from coec.io.mcap.window_reader import read_result
+from coec.io.mcap.windows import read_result
 from coec.schemas.message import to_json
 
 MIB = 2**20
@@ -96,7 +96,7 @@ def test_no_windows_need_no_process() -> None:
 @pytest.mark.slow
 def test_a_cluster_of_ray_decides_the_same(recorded: Path, poisoned: str) -> None:
     pytest.importorskip("ray", reason="needs the optional extra `ray`")
-    from coec.fleet.ray_engine import RayEngine
+    from coec.fleet.engines import RayEngine
 
     want = expected(recorded)
     one, two = want

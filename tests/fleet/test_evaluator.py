@@ -12,7 +12,7 @@ from coec.config import CalibrationConfig
 from coec.errors import ConfigError, UsageError
 from coec.fleet.evaluator import ReplaySettings, WindowEvaluator, load_settings
 from coec.fleet.jobs import Job
-from coec.io.mcap.window_reader import read_result, read_vehicle
+from coec.io.mcap.windows import read_result, read_vehicle
 from coec.schemas.message import to_json
 from support.fleet import WINDOW_CONFIGURATION
 
@@ -57,7 +57,7 @@ def test_a_configuration_that_does_not_know_the_pair_is_an_error_of_the_window(w
 
 
 def test_another_rig_decides_for_its_pair(window: Path, tmp_path: Path) -> None:
-    from coec.io.mcap.window_reader import read_window
+    from coec.io.mcap.windows import read_window
     from coec.io.rig_files import rig_to_json
 
     rig = read_window(window)[0].rig

@@ -16,10 +16,10 @@ import pytest
 
 from coec import __version__
 from coec.errors import SourceError
-from coec.fleet import ray_engine as engine_module
+from coec.fleet import engines as engine_module
+from coec.fleet.engines import NODE_DIED, SILENCE_S, RayEngine
 from coec.fleet.evaluator import ReplaySettings
 from coec.fleet.jobs import Job, StoreCredentials, empty_row, failed_row
-from coec.fleet.ray_engine import NODE_DIED, SILENCE_S, RayEngine
 from coec.fleet.worker_pool import NODE_LOST, NOT_ON_NODE, FleetError, WorkerLimits
 
 BOUNDS = WorkerLimits(600.0, 2**30)

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 from coec.errors import UsageError
-from coec.fleet import tables
-from coec.fleet.report import report
-from coec.io.mcap.window_reader import read_result
+from coec.fleet.report import EXAMPLE_QUERIES, columns, connect, report, view_statement, write_tables
+from coec.io.mcap.windows import read_result
 from coec.reports import fleet_page
 from coec.reports.page import VerdictBanner, render
 from coec.reports.page_parts import Provenance
-from coec.schemas.fleet import FleetNow, FleetReport, PairNow, WindowRow
+from coec.schemas.documents import FleetNow, FleetReport, PairNow, WindowRow
 from coec.schemas.replies import Alarms, CalibrationResult
 from support.fleet import FAILED_SHARE, REFUSED_SHARE, WINDOW_SIGMA, fleet_rows
 from support.messages import heartbeat
@@ -41,7 +40,7 @@ def rows(pattern: CalibrationResult) -> list[WindowRow]:
 @pytest.fixture(scope="module")
 def results(rows: list[WindowRow], tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("results")
-    tables.write_tables(folder, rows, "part-1")
+    write_tables(folder, rows, "part-1")
     return folder
 
 
@@ -97,7 +96,7 @@ def test_an_axis_that_no_window_determines_has_no_drift(rows: list[WindowRow], t
         for row in rows[:WINDOWS]
         if row.result is not None
     ]
-    tables.write_tables(tmp_path, blind, "part-1")
+    write_tables(tmp_path, blind, "part-1")
     (pair,) = report(tmp_path, None).pairs
     assert pair.drift[5] is None
     assert pair.latest[5] is None
@@ -122,7 +121,7 @@ def test_what_another_batch_decided_otherwise(results: Path, rows: list[WindowRo
         update={"result": None, "decided": None, "error_code": "deadline", "error": "late"}
     )
     for name, batch in (("before", before), ("now", now)):
-        tables.write_tables(tmp_path / name, [*batch, batch[0].model_copy(update={"url": "a copy of it"})], "part-1")
+        write_tables(tmp_path / name, [*batch, batch[0].model_copy(update={"url": "a copy of it"})], "part-1")
     changes = report(tmp_path / "now", tmp_path / "before").changes
     assert changes is not None
     assert (changes.both, changes.identical) == (len(rows), len(rows) - 2)
@@ -137,18 +136,18 @@ def test_what_another_batch_decided_otherwise(results: Path, rows: list[WindowRo
 
 
 def test_every_example_of_a_query_answers(results: Path) -> None:
-    connection = tables.connect(results)
-    for question, query in tables.EXAMPLE_QUERIES.items():
+    connection = connect(results)
+    for question, query in EXAMPLE_QUERIES.items():
         rows = connection.execute(query).fetchall()
         assert rows or "otherwise" in question, question
-    assert dict(tables.columns(results))["correlation"] == "DOUBLE[]"
+    assert dict(columns(results))["correlation"] == "DOUBLE[]"
 
 
 def test_the_view_that_is_printed_is_the_one_that_is_requested(rows: list[WindowRow], tmp_path: Path) -> None:
     """A vehicle whose name is a number keeps its zeros."""
-    tables.write_tables(tmp_path, [row.model_copy(update={"vehicle": "007"}) for row in rows[:2]], "part-1")
+    write_tables(tmp_path, [row.model_copy(update={"vehicle": "007"}) for row in rows[:2]], "part-1")
     connection = duckdb.connect()
-    connection.execute(tables.view_statement("mine", tmp_path))
+    connection.execute(view_statement("mine", tmp_path))
     assert connection.execute("SELECT DISTINCT vehicle FROM mine").fetchall() == [("007",)]
 
 
@@ -163,7 +162,7 @@ def test_false_alarms_of_vehicles_stand_on_the_page(results: Path) -> None:
 
 
 def test_a_drift_that_one_window_cannot_decide_is_not_denied(rows: list[WindowRow], tmp_path: Path) -> None:
-    tables.write_tables(
+    write_tables(
         tmp_path, [next(row for row in rows if row.result and row.result.verdict.decision == "accepted")], "part-1"
     )
     reported = report(tmp_path, None)

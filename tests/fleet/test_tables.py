@@ -11,13 +11,13 @@ import duckdb
 import pytest
 
 from coec.errors import OutputError, SourceError, UsageError
-from coec.fleet import batch, tables
+from coec.fleet import batch, report
 from coec.fleet.batch import BatchFolder
 from coec.fleet.evaluator import ReplaySettings, WindowEvaluator
 from coec.fleet.jobs import Job, empty_row, lost_row
 from coec.fleet.worker_pool import FleetError
 from coec.io import storage
-from coec.schemas.fleet import WindowRow
+from coec.schemas.documents import WindowRow
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def requested(folder: Path, query: str) -> list[tuple[Any, ...]]:
 
 
 def test_a_row_holds_everything_that_was_decided(tmp_path: Path, row: WindowRow) -> None:
-    tables.write_tables(tmp_path, [row, lost_row(Job("gone.mcap"), "process_died", "it ended")], "part-1")
+    report.write_tables(tmp_path, [row, lost_row(Job("gone.mcap"), "process_died", "it ended")], "part-1")
     result = row.result
     assert result is not None
     ((url, vehicle, date, accepted, rx, sigma, figures, pitch_height, text),) = requested(
@@ -61,7 +61,7 @@ def test_a_row_holds_everything_that_was_decided(tmp_path: Path, row: WindowRow)
 
 def test_a_vehicle_of_any_name_has_a_folder_within_the_folder(tmp_path: Path) -> None:
     for index, vehicle in enumerate(["../../etc", "a/b", "x=1", "", "Ä ö"]):
-        tables.write_tables(
+        report.write_tables(
             tmp_path, [empty_row(Job(f"{index}"), {}).model_copy(update={"vehicle": vehicle})], f"part-{index}"
         )
     assert len(list(tmp_path.glob("date=unknown/vehicle=*/*.parquet"))) == 5

@@ -26,7 +26,7 @@ from coec.fleet.worker_pool import (
     WorkerStarted,
     WorkerStopped,
 )
-from coec.schemas.fleet import WindowRow
+from coec.schemas.documents import WindowRow
 
 BOUNDS = WorkerLimits(600.0, 2**30)
 

@@ -40,20 +40,18 @@ from coec.config import (
 )
 from coec.errors import SourceError, UsageError
 from coec.geometry.cameras import build, project_point
-from coec.io.baseline_file import baseline_to_json, load_baseline
 from coec.io.depth.model_cards import CARDS, read_card
 from coec.io.images import Inspector, decode_bgr, decode_depth, encode_depth_png, encode_png
 from coec.io.logs import LossCounter
-from coec.io.mcap.bag_writer import salvage_snippet
 from coec.io.mcap.reader import McapMessage, read_records
-from coec.io.mcap.window_reader import PART_SUFFIX, is_window, read_result, read_window
-from coec.io.mcap.window_writer import salvage
+from coec.io.mcap.windows import is_window, read_result, read_window, salvage
+from coec.io.mcap.writer import PART_SUFFIX, salvage_snippet
 from coec.io.msgpack_frames import decode_camera, decode_ego, decode_lidar
 from coec.io.recordings.cloud_files import load_cloud
 from coec.io.recordings.kitti import read_numbers, read_stamps
 from coec.io.recordings.layouts import open_source
 from coec.io.recordings.recording_source import RecordingSource
-from coec.io.rig_files import camera_of, rig_of, rig_to_json
+from coec.io.rig_files import baseline_to_json, camera_of, load_baseline, rig_of, rig_to_json
 from coec.io.ros import message_decoding, message_encoding, messages
 from coec.io.ros.camera_info import decode_info, intrinsics_of_info
 from coec.io.ros.message_decoding import ENCODINGS

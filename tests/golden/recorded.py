@@ -16,8 +16,7 @@ from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, ObjectiveC
 from coec.geometry import se3
 from coec.io.depth.depth_maps import open_depth
 from coec.io.images import GreyImages
-from coec.io.mcap.window_reader import read_window
-from coec.io.mcap.window_writer import WindowWriter, write_result
+from coec.io.mcap.windows import WindowWriter, read_window, write_result
 from coec.io.serialise import result_of
 from golden.reference import DATA, plain
 from golden.scene import Drive, write

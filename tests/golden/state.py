@@ -13,8 +13,7 @@ import numpy as np
 from calibration.rig.test_inconsistent_edges import EDGE, RIG
 from coec.calibration.rig.graph import RigGraph
 from coec.config import Config
-from coec.io.baseline_file import BASELINES, baseline_hash, load_baselines, save_baseline
-from coec.io.rig_files import rig_from_json
+from coec.io.rig_files import BASELINES, baseline_hash, load_baselines, rig_from_json, save_baseline
 from coec.service.discovery import DiscoveryStore
 from coec.service.records.history import PairHistory
 from coec.service.records.rig_store import RigStore

@@ -10,7 +10,7 @@ import pytest
 
 from coec.config import StateConfig
 from coec.errors import StateError
-from coec.io.baseline_file import (
+from coec.io.rig_files import (
     baseline_from_json,
     baseline_hash,
     baseline_of_rig,

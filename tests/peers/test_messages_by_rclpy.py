@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, FramePair, ImageFormat, LidarFrame, Rig
 from coec.config import CalibrationConfig, LimitsConfig
 from coec.geometry.cameras import MODELS, build
-from coec.io.mcap.window_writer import WindowWriter
+from coec.io.mcap.windows import WindowWriter
 from coec.io.ros import message_decoding, message_encoding, messages
 from coec.io.ros.message_encoding import DiagnosticLevel, DiagnosticStatus
 from peers.environments import Peer, peer

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from coec.calibration.types import EgoMotion
+from coec.calibration.types import EgoMotion, Frame
 from coec.geometry import se3
 from coec.io.ros import messages
 from coec.io.ros.topics import FrameTopics, PairTopics
-from coec.io.zenoh.player import Frame, stream_of
+from coec.io.zenoh.player import stream_of
 from coec.schemas.keys import TF_STATIC
 from e2e.drives import SECONDS, STEP_S, STEPPED, Drive, rendered
 from e2e.processes import Router, Service, portions, service

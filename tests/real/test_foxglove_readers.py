@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from coec.io.mcap.window_reader import read_window
+from coec.io.mcap.windows import read_window
 from support.fleet import recorded_windows
 
 pytestmark = pytest.mark.slow

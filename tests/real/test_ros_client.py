@@ -16,8 +16,8 @@ from typing import Any
 
 import pytest
 
+from coec.calibration.types import Frame
 from coec.config import load_config
-from coec.io.zenoh.player import Frame
 from e2e.drives import Drive, rendered, without_depth
 from e2e.processes import COMMAND, PATIENCE_S, Service, environment, free_endpoint
 from e2e.ros_vehicle import CAMERA, EGO, INFO, POINTS, TF, camera_info, message_of

@@ -35,8 +35,15 @@ from coec.reports.incident_page import FetchedIncident
 from coec.reports.page import Compare, Page, Pictures
 from coec.reports.page_parts import Provenance, file_picture
 from coec.reports.pictures import slid_pictures
-from coec.schemas.documents import Absent, FetchedWindow
-from coec.schemas.fleet import DayOfPair, FalseAlarms, FigureOfFleet, FleetReport, PairOfFleet
+from coec.schemas.documents import (
+    Absent,
+    DayOfPair,
+    FalseAlarms,
+    FetchedWindow,
+    FigureOfFleet,
+    FleetReport,
+    PairOfFleet,
+)
 from coec.schemas.replies import (
     CalibrationReport,
     CalibrationResult,

@@ -13,8 +13,16 @@ from coec.config import LimitsConfig
 from coec.geometry import se3
 from coec.geometry.edges.image_edges import Rectangle
 from coec.io.images import GreyImages
-from coec.reports.close_ups import COLOURS, Caption, close_ups, sentences
-from coec.reports.difference_regions import difference_regions, outlines_of, shift_px, spread_px
+from coec.reports.close_ups import (
+    COLOURS,
+    Caption,
+    close_ups,
+    difference_regions,
+    outlines_of,
+    sentences,
+    shift_px,
+    spread_px,
+)
 from support import scenes
 
 TURN = np.array([0.0, radians(0.5), 0.0, 0.0, 0.0, 0.0])

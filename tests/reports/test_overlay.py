@@ -7,7 +7,7 @@ import pytest
 
 from coec.geometry.cameras import build
 from coec.io.images import WHOLE_SCALE, RangeScale
-from coec.reports.overlay import LINE_SHARE, render_points, titled
+from coec.reports.drawing import LINE_SHARE, render_points, titled
 
 WIDTH, HEIGHT = 960, 540
 CAMERA = build("pinhole", width=WIDTH, height=HEIGHT, fx=400.0, fy=400.0, cx=480.0, cy=270.0)

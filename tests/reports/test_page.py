@@ -21,7 +21,7 @@ from coec.reports.charts import Chart, Ground, Mark, Series
 from coec.reports.formatting import NONE, number, percent, significant
 from coec.reports.page import Page, Section, Text, embedded, render
 from coec.reports.page_parts import CAPTIONS, figures_block
-from coec.schemas.fleet import DayOfPair, FleetReport, PairOfFleet
+from coec.schemas.documents import DayOfPair, FleetReport, PairOfFleet
 from coec.schemas.replies import MetricReply
 from reports import pages
 from reports.pages import EVIL, png

@@ -13,15 +13,8 @@ from coec.config import LimitsConfig
 from coec.geometry import se3
 from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
 from coec.io.images import GreyImages
-from coec.reports.difference_regions import angles_deg
-from coec.reports.residual_map import (
-    lens_residual,
-    lens_sentences,
-    local_shifts,
-    residual_map,
-    residuals_px,
-    sentences,
-)
+from coec.reports.close_ups import angles_deg
+from coec.reports.pictures import lens_residual, lens_sentences, local_shifts, residual_map, residuals_px, sentences
 from support import scenes
 
 

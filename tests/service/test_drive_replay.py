@@ -19,9 +19,16 @@ from coec.config import Config
 from coec.errors import SourceError
 from coec.service import camera_lidar_pair as runtime_pair
 from coec.service import drive_replay
-from coec.service.decision_log import Decision, differences, read_log, write_log
-from coec.service.drive_replay import DriveReplay, ReplayedDrive
-from coec.service.replay_page import outline, write_replay_page
+from coec.service.drive_replay import (
+    Decision,
+    DriveReplay,
+    ReplayedDrive,
+    differences,
+    outline,
+    read_log,
+    write_log,
+    write_replay_page,
+)
 from coec.service.worker.worker_jobs import WorkerJob
 from service.test_pair_disturbed import streams
 from support.vehicles import BEGIN_S, NS_PER_S, STEP_S, InstantRecorder, OracleWorker, PairBench, pair_configuration

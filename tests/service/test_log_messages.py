@@ -14,8 +14,7 @@ from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFo
 from coec.io.frame_validation import Refusal
 from coec.io.logs import LOST, LossCounter, loss_text
 from coec.service.engine import frame_selector
-from coec.service.ingest.decoder import EXPLAINED
-from coec.service.ingest.sensor_stream import QUIET_S, RATE_FRAMES, SILENT_S, StreamLog
+from coec.service.ingest.decoder import EXPLAINED, QUIET_S, RATE_FRAMES, SILENT_S, StreamLog
 from coec.service.worker.compilation import Compiling
 from support.vehicles import BEGIN_S, DRIVE_END_S, NS_PER_S, STEP_S, PairBench, SlowWorker, frame_pair_at
 

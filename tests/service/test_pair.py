@@ -17,7 +17,7 @@ from coec.calibration.monitor.change_detector import alarm_levels
 from coec.calibration.types import (
     Reason,
 )
-from coec.io.baseline_file import save_baseline
+from coec.io.rig_files import save_baseline
 from coec.io.serialise import matrix_of
 from coec.io.storage import StateFile
 from coec.service.engine.pair_stream import PairStream

@@ -16,7 +16,7 @@ import pytest
 from coec.calibration.baseline import learned_hash
 from coec.config import AuthorityConfig, UplinkConfig
 from coec.geometry import se3
-from coec.io.baseline_file import save_baseline
+from coec.io.rig_files import save_baseline
 from coec.io.zenoh.bus import Bus, Request, Route
 from coec.schemas.keys import COMMAND_TIMEOUT_MS, Keys
 from coec.service.api import command_execution

@@ -19,9 +19,10 @@ import pytest
 
 from coec.calibration.frames.pairing import MOTION_LATE_NS
 from coec.calibration.frames.window import SliceClosed
-from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4
+from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame
 from coec.config import LimitsConfig
 from coec.service.engine.messages import Action
+from coec.service.recording.recorder import RecordBetween, RecordPair
 from coec.service.worker.worker_jobs import Kind, WorkerJob, unpack_pairs
 from support.vehicles import BEGIN_S, DRIVE_END_S, NS_PER_S, OracleWorker, PairBench, SlowWorker, frame_pair_at
 
@@ -97,9 +98,10 @@ class Watched:
             self.checked.append((pair.camera.stamp_ns, pair.lidar.stamp_ns, pair.motion))
             return select(pair)
 
-        def added(window_id: str, pair: FramePair, T_camera_lidar: Matrix4) -> None:
-            self.windows.append((window_id, pair.stamp_ns, T_camera_lidar.tobytes()))
-            add(window_id, pair, T_camera_lidar)
+        def added(item: RecordPair | RecordBetween) -> None:
+            if isinstance(item, RecordPair):
+                self.windows.append((item.window_id, item.pair.stamp_ns, item.T_camera_lidar.tobytes()))
+            add(item)
 
         def finished(slice_end: SliceClosed) -> None:
             self.windows.append(slice_end)

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from coec.errors import ConfigError, UnavailableError
-from coec.io.baseline_file import BASELINES, load_baseline, save_baseline
 from coec.io.disk_writer import DiskWriter
+from coec.io.rig_files import BASELINES, load_baseline, save_baseline
 from coec.service.process_lifetime import locked
 from coec.service.records.rig_store import RIG_FILE, RigBaseline
 from support.estimates import a_baseline

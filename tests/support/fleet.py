@@ -24,11 +24,10 @@ from coec.config import CalibrationConfig, DepthConfig, LimitsConfig, ObjectiveC
 from coec.fleet.jobs import Job, empty_row, lost_row
 from coec.io.depth.depth_maps import open_depth
 from coec.io.images import GreyImages
-from coec.io.mcap.window_reader import read_window
-from coec.io.mcap.window_writer import WindowWriter, write_result
+from coec.io.mcap.windows import WindowWriter, read_window, write_result
 from coec.io.recordings import window_cutting
 from coec.io.serialise import result_of
-from coec.schemas.fleet import WindowRow
+from coec.schemas.documents import WindowRow
 from coec.schemas.replies import CalibrationResult, Reason, Verdict
 from support.simulated_drives import rendered_drive
 

@@ -16,7 +16,7 @@ from coec.config import CalibrationConfig, StateConfig
 from coec.geometry.cameras import build
 from coec.io.logs import LossCounter
 from coec.service.ingest.frame_buffers import Snippet
-from coec.service.recording.recorder import Recorder, RecordingPlan, RecordingThread
+from coec.service.recording.recorder import Recorder, RecordingPlan, RecordingThread, RecordPair
 from coec.service.recording.snippets import SnippetRecorder, SnippetStore
 from coec.service.recording.window_store import WindowStore
 from support.fake_worker import wait_until
@@ -65,7 +65,7 @@ def run(folder: Path, life: int) -> None:
         name, before = f"front-{begin_ns}", len(finished)
         pairs = [pair(begin_ns + index) for index in range(PAIRS)]
         for one in pairs:
-            recorder.add(name, one, NOMINAL)
+            recorder.add(RecordPair(name, one, NOMINAL))
         recorder.end(SliceClosed(name, PAIRS, True))
         neighbour.submit(
             Snippet("suspect", begin_ns, NOMINAL, tuple(frame for one in pairs for frame in (one.lidar, one.camera)))

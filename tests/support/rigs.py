@@ -23,7 +23,7 @@ from coec.calibration.rig.lidar_sampling import LidarRig, RangeBias
 from coec.calibration.rig.rig_estimator import EdgeWindow, ServedEdge, VehicleRig
 from coec.calibration.state import PairState, initial_state
 from coec.calibration.tracker import Measurement
-from coec.calibration.types import EgoMotion, LidarFrame, Matrix4, Reason, Uncertainty
+from coec.calibration.types import EgoMotion, Frame, LidarFrame, Matrix4, Reason, Uncertainty
 from coec.config import BudgetConfig, LidarEdgesConfig, LimitsConfig, PairConfig
 from coec.geometry import se3
 from coec.io import nearest_neighbours
@@ -35,7 +35,7 @@ from coec.service.cpu_budget import Budget
 from coec.service.engine.lidar_pairs import LidarPairs
 from coec.service.engine.rig import RigEstimator, RigMember, RigSnapshot
 from coec.service.engine.vehicle import Vehicle
-from coec.service.ingest.decoder import EGO, Frame
+from coec.service.ingest.decoder import EGO
 from coec.service.worker.supervisor import Worker
 from coec.service.worker.worker_jobs import (
     Answer,

@@ -24,10 +24,10 @@ import numpy as np
 import xxhash
 import zenoh
 
-from coec.calibration.types import CameraFrame, LidarFrame
+from coec.calibration.types import CameraFrame, Frame, LidarFrame
 from coec.io.images import encode_jpeg
 from coec.io.ros import message_encoding
-from coec.io.zenoh.player import Frame, stream_of
+from coec.io.zenoh.player import stream_of
 from coec.io.zenoh.ros_node import has_subscribers
 from support.fake_worker import wait_until
 

@@ -20,8 +20,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TypeVar
 
-from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
-from coec.io.recordings.recording_source import FramewiseRecording, RecordedFrame, SensorMessage, parse_spec
+from coec.calibration.types import CameraFrame, EgoMotion, Frame, LidarFrame
+from coec.io.recordings.recording_source import FramewiseRecording, RecordedFrame, parse_spec
 from coec_lab.simulation.source import open_sim
 from conftest import REPOSITORY
 
@@ -73,7 +73,7 @@ def _same(frame: F) -> F:
     return frame
 
 
-def cached_messages(identity: object, render: Callable[[], list[SensorMessage]]) -> list[SensorMessage]:
+def cached_messages(identity: object, render: Callable[[], list[Frame]]) -> list[Frame]:
     """Messages that were drawn before and kept under what they are (by its `repr`), or that are drawn now. Processes
     that want the same wait for the one that draws it."""
     path = CACHE / _fingerprint() / f"{hashlib.sha256(repr(identity).encode()).hexdigest()[:16]}.pickle"
@@ -81,14 +81,14 @@ def cached_messages(identity: object, render: Callable[[], list[SensorMessage]])
     with path.with_suffix(".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if path.is_file():
-            cached: list[SensorMessage] = pickle.loads(path.read_bytes())
+            cached: list[Frame] = pickle.loads(path.read_bytes())
             return cached
         messages = render()
         _store(path, messages)
     return messages
 
 
-def _store(path: Path, messages: list[SensorMessage]) -> None:
+def _store(path: Path, messages: list[Frame]) -> None:
     for folder in CACHE.iterdir():
         if folder != path.parent:
             shutil.rmtree(folder, ignore_errors=True)  # the other half of the run may do the same

@@ -64,7 +64,14 @@ from coec.service.configuration import redacted_configuration
 from coec.service.cpu_budget import Budget
 from coec.service.engine.rig import RigEstimator
 from coec.service.engine.vehicle import Vehicle
-from coec.service.recording.recorder import RecordingPlan, RecordingThread, WindowLost, WindowRecorded
+from coec.service.recording.recorder import (
+    RecordBetween,
+    RecordingPlan,
+    RecordingThread,
+    RecordPair,
+    WindowLost,
+    WindowRecorded,
+)
 from coec.service.recording.snippets import SnippetRecorder
 from coec.service.recording.window_store import WindowStore
 from coec.service.records.pair_store import PairStore
@@ -294,12 +301,9 @@ class InstantRecorder:
     def reconfigure(self, configuration: CalibrationConfig) -> None:
         self.configuration = configuration
 
-    def add(self, window_id: str, pair: FramePair, T_camera_lidar: Matrix4) -> None:
-        del window_id, T_camera_lidar
-        self._stamps.append(pair.stamp_ns)
-
-    def add_between(self, window_id: str, pair: FramePair) -> None:
-        self.between.setdefault(window_id, []).append(pair.stamp_ns)
+    def add(self, item: RecordPair | RecordBetween) -> None:
+        stamps = self._stamps if isinstance(item, RecordPair) else self.between.setdefault(item.window_id, [])
+        stamps.append(item.pair.stamp_ns)
 
     def end(self, slice_end: SliceClosed) -> None:
         stamps, self._stamps = self._stamps, []

@@ -19,7 +19,7 @@ from coec.calibration.types import (
 )
 from coec.config import CalibrationConfig, SearchConfig
 from coec.geometry import cameras, se3
-from coec.io.mcap.window_writer import RecordedWindow, WindowWriter
+from coec.io.mcap.windows import RecordedWindow, WindowWriter
 from coec.schemas.replies import CalibrationResult, MetricReply, Reason, Transform, Verdict
 
 WIDTH, HEIGHT = 64, 48

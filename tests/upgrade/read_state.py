@@ -18,7 +18,7 @@ names = import_module(f"{__package__}.names" if __package__ else "names")
 """The file beside this one, which runs as a program, too."""
 
 lifecycle = names.first_of("coec.calibration.state", "coec.calibration.lifecycle")
-baseline_file = names.first_of("coec.io.baseline_file", "coec.adapters.files.baseline_file")
+baseline_file = names.first_of("coec.io.baseline_file", "coec.adapters.files.baseline_file", "coec.io.rig_files")
 rig_from_json = names.first_of("coec.io.rig_files:rig_from_json", "coec.adapters.files.rig:rig_from_json")
 PairHistory = names.first_of("coec.service.records.history:PairHistory", "coec.runtime.decisions.history:History")
 Incidents = names.first_of("coec.service.records.incidents:Incidents", "coec.runtime.decisions.incidents:Incidents")

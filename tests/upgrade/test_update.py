@@ -18,9 +18,8 @@ from coec.calibration.state import ExtrinsicHold, PairState, after_observation, 
 from coec.calibration.state_machine import HealthState
 from coec.calibration.types import Rig
 from coec.config import CalibrationConfig, Config, StateConfig
-from coec.io.baseline_file import BASELINES, baseline_hash, load_baseline
 from coec.io.logs import LossCounter
-from coec.io.rig_files import rig_from_json
+from coec.io.rig_files import BASELINES, baseline_hash, load_baseline, rig_from_json
 from coec.service.discovery import DiscoveryStore
 from coec.service.recording.window_store import WindowStore
 from coec.service.records.history import PairHistory

@@ -39,7 +39,7 @@ lifecycle = names.first_of("coec.calibration.state", "coec.calibration.lifecycle
 learned_hash = names.first_of(
     "coec.calibration.baseline:learned_hash", "coec.calibration.commissioning.baseline:learned_hash"
 )
-baseline_file = names.first_of("coec.io.baseline_file", "coec.adapters.files.baseline_file")
+baseline_file = names.first_of("coec.io.baseline_file", "coec.adapters.files.baseline_file", "coec.io.rig_files")
 conversions = names.first_of("coec.io.serialise", "coec.adapters.files.conversions")
 rig_to_json = names.first_of("coec.io.rig_files:rig_to_json", "coec.adapters.files.rig:rig_to_json")
 StateFile = names.first_of("coec.io.storage:StateFile", "coec.adapters.files.state_file:StateFile")

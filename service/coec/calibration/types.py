@@ -188,6 +188,10 @@ class Compensation(StrEnum):
     DISABLED = "disabled"
 
 
+Frame = CameraFrame | LidarFrame | EgoMotion
+"""What one sensor sends."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FramePair:
     """A camera frame and the LiDAR sweep nearest to it in sensor time; `motion` is the ego-motion at the camera stamp,

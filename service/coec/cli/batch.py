@@ -14,10 +14,13 @@ import typer
 
 from coec.cli.options import Json
 from coec.errors import UsageError
+from coec.reports import console
+from coec.reports.console import PlainColumn
+from coec.reports.formatting import count
 
 if TYPE_CHECKING:
     from coec.fleet.worker_pool import Engine, WorkerLimits
-    from coec.schemas.fleet import BatchReport, WindowRow
+    from coec.schemas.documents import BatchReport, WindowRow
 
 MIB = 2**20
 
@@ -91,7 +94,6 @@ def batch(
     from coec.fleet.evaluator import load_settings
     from coec.fleet.jobs import jobs_of
     from coec.fleet.worker_pool import WorkerLimits
-    from coec.reports import console
 
     terms = load_settings(with_config, rig, depth)
     inputs = jobs_of(windows)
@@ -117,12 +119,12 @@ def _engine(
     name: str, jobs: int | None, bounds: WorkerLimits, ray_address: str | None, *, send_credentials: bool
 ) -> Engine:
     if name == "ray":
-        from coec.fleet.ray_engine import RayEngine
+        from coec.fleet.engines import RayEngine
 
         return RayEngine(jobs, bounds, ray_address, send_credentials=send_credentials)
     if ray_address is not None:
         raise UsageError("--ray-address is for --engine ray")
-    from coec.fleet.local_engine import LocalEngine
+    from coec.fleet.engines import LocalEngine
 
     return LocalEngine(jobs or len(os.sched_getaffinity(0)), bounds)
 
@@ -131,10 +133,6 @@ def _engine(
 def _progress(total: int) -> Iterator[Callable[[WindowRow], None]]:
     """A function to call with every row; it shows a bar with rate and remaining time, or prints a line now and then."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
-
-    from coec.reports import console
-    from coec.reports.console import PlainColumn
-    from coec.reports.formatting import count
 
     bars = Progress(
         PlainColumn("windows"),
@@ -166,9 +164,6 @@ def _progress(total: int) -> Iterator[Callable[[WindowRow], None]]:
 
 
 def _show(report: BatchReport, cores: int) -> None:
-    from coec.reports import console
-    from coec.reports.formatting import count
-
     rows = console.table("windows", "", right=(1,))
     rows.add_row("in all", str(report.windows))
     if report.kept:

@@ -12,33 +12,39 @@ import typer
 from coec.calibration_options import CalibrationOptions
 from coec.cli.options import Fix, Json, Source, show_correction, with_calibration_options
 from coec.errors import LensError, OutputError
+from coec.reports import console
+from coec.reports.console import StageTimes
 
 if TYPE_CHECKING:
     from coec.geometry.cameras import Camera
     from coec.io.recordings.window_cutting import LoadedWindow
     from coec.recording import Solution
-    from coec.reports.console import StageTimes
+
+
+OutputFolder = Annotated[
+    Path | None,
+    typer.Option(
+        "--output",
+        help="Write report.html, overlay_before.png, overlay_after.png, close_ups.png, residuals.png and "
+        "result.json; with --camera-model also lens_residual.png, even if the model is refused.",
+        metavar="DIR",
+    ),
+]
+ShowIntrinsics = Annotated[
+    bool,
+    typer.Option(
+        "--intrinsics",
+        help="Also show focal length, principal point and radial distortion as the window has them, with σ. In "
+        "JSON they are always there (`lens`).",
+    ),
+]
 
 
 @with_calibration_options(CalibrationOptions)
 def calibrate(
     source: Source,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            help="Write report.html, overlay_before.png, overlay_after.png, close_ups.png, residuals.png and "
-            "result.json; with --camera-model also lens_residual.png, even if the model is refused.",
-            metavar="DIR",
-        ),
-    ] = None,
-    intrinsics: Annotated[
-        bool,
-        typer.Option(
-            "--intrinsics",
-            help="Also show focal length, principal point and radial distortion as the window has them, with σ. In "
-            "JSON they are always there (`lens`).",
-        ),
-    ] = False,
+    output: OutputFolder = None,
+    intrinsics: ShowIntrinsics = False,
     as_json: Json = False,
     fix: Fix = False,
     **options: Unpack[CalibrationOptions],
@@ -46,16 +52,16 @@ def calibrate(
     """Calibrate from a recording: exit 0 if the result is accepted, 1 if the self-diagnosis refuses it."""
     from coec.config import WindowConfig
     from coec.io import user_files as files
-    from coec.io.recordings import manifest_correction, window_cutting
+    from coec.io.recordings import window_cutting
+    from coec.io.recordings.manifest import has_manifest, manifest_of
     from coec.recording import perturbation_of
-    from coec.reports import calibration, console
-    from coec.reports.console import StageTimes
+    from coec.reports import calibration
 
     if output is not None:
         files.try_folder(output)
     if options.get("perturb") is not None:
         perturbation_of(options["perturb"] or ())
-    manifest = manifest_correction.manifest_of(source) if fix else None
+    manifest = manifest_of(source) if fix else None
     with console.progress() as bars:
         times = StageTimes(bars)
         loaded = window_cutting.load_window(
@@ -79,7 +85,7 @@ def calibrate(
         _show(solution, document, intrinsics=intrinsics)
     if manifest is not None and solution.mistake is not None:
         show_correction(manifest, solution.mistake, loaded.window.rig)
-    elif solution.mistake is not None and solution.mistake.correctable and manifest_correction.has_manifest(source):
+    elif solution.mistake is not None and solution.mistake.correctable and has_manifest(source):
         console.say("coec: the same command with --fix writes a corrected dataset.yaml")
     if not_written is not None:
         console.say(f"coec: {not_written}")

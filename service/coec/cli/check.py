@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any
 from coec.calibration_options import SolverOptions, configuration_of
 from coec.cli.options import Depth, Fix, Json, Source, show_correction
 from coec.errors import CalibrationError, SourceError
+from coec.reports import console
+from coec.reports.console import StageTimes
+from coec.reports.formatting import count
 
 if TYPE_CHECKING:
     from coec.calibration.types import Estimate, Mistake
     from coec.io.recordings.layouts import RecordingSource
-    from coec.reports.console import StageTimes
     from coec.reports.recording_fitness import Cadence, Fitness, Notice
 
 PAIRS = 12
@@ -39,11 +41,8 @@ def check(
     """Show the content of a recording and predict the verdict: exit 1 if a calibration is impossible or refused."""
     from coec.calibration.monitor.check_verdict import MIN_PAIRS
     from coec.io.recordings.layouts import open_source
-    from coec.io.recordings.manifest_correction import manifest_of
-    from coec.reports import console
-    from coec.reports.console import StageTimes
-    from coec.reports.formatting import count
-    from coec.reports.recording_fitness import fitness_of
+    from coec.io.recordings.manifest import manifest_of
+    from coec.reports.recording_fitness import Notice, fitness_of
 
     manifest = manifest_of(source) if fix else None
     try:
@@ -63,7 +62,9 @@ def check(
         enough = f"{count(seen.camera.frames, 'camera frame')} suffice here; a check by the service needs {MIN_PAIRS}."
         remarks = (replace(n, level="warn", text=enough) if n.code == TOO_FEW else n for n in seen.remarks)
         seen = replace(seen, remarks=tuple(remarks))
-    notes = _ordered((*_of_mistake(mistake), *seen.remarks, *_of_trial(trial, seen, mistake)))
+    of_mistake = () if mistake is None else (Notice("fail", mistake.code, mistake.text),)
+    every = (*of_mistake, *seen.remarks, *_of_trial(trial, seen, mistake))
+    notes = tuple(sorted(every, key=lambda note: list(LEVEL_STYLES).index(note.level)))  # the most important first
     if as_json:
         console.print_json(_document(source, replace(seen, remarks=notes), trial, mistake))
     else:
@@ -96,12 +97,6 @@ def _trial(
         return error, None
 
 
-def _of_mistake(mistake: Mistake | None) -> tuple[Notice, ...]:
-    from coec.reports.recording_fitness import Notice
-
-    return () if mistake is None else (Notice("fail", mistake.code, mistake.text),)
-
-
 def _of_trial(trial: Estimate | CalibrationError | None, seen: Fitness, mistake: Mistake | None) -> tuple[Notice, ...]:
     """What the trial says of a calibration: for what it will be refused, and what a longer window may remedy. Clocks
     that are apart look like a camera that moves."""
@@ -123,11 +118,6 @@ def _of_trial(trial: Estimate | CalibrationError | None, seen: Fitness, mistake:
         ),
         *(Notice("warn", reason.code, f"{MAY_REFUSE}{reason.text}") for reason in others),
     )
-
-
-def _ordered(notes: tuple[Notice, ...]) -> tuple[Notice, ...]:
-    """The most important first."""
-    return tuple(sorted(notes, key=lambda note: list(LEVEL_STYLES).index(note.level)))
 
 
 def _prediction(seen: Fitness, trial: Estimate | CalibrationError | None) -> str:
@@ -168,7 +158,6 @@ def _document(
 
 def _show(name: str, seen: Fitness, trial: Estimate | CalibrationError | None) -> None:
     from coec.calibration.types import Estimate
-    from coec.reports import console
 
     console.show(f"{name}: {seen.seconds:.1f} s")
     streams = console.table("stream", "frames", "Hz", "longest gap", "what", right=(1, 2, 3))
@@ -198,8 +187,6 @@ def _show(name: str, seen: Fitness, trial: Estimate | CalibrationError | None) -
 
 def _show_trial(trial: Estimate) -> None:
     from coec.io.serialise import degrees_or_null
-    from coec.reports import console
-    from coec.reports.formatting import count
 
     axes = console.table("axis", "from the recording's own", "± σ", "unit", right=(1, 2))
     correction, sigma = degrees_or_null(trial.correction), degrees_or_null(trial.sigma)
@@ -213,7 +200,6 @@ def _show_trial(trial: Estimate) -> None:
 
 def _show_topics(source: str) -> None:
     from coec.io.recordings.recording_source import is_bag, parse_spec
-    from coec.reports import console
 
     spec = parse_spec(source)
     if not is_bag(spec):

@@ -9,6 +9,7 @@ import typer
 
 from coec.cli.options import Json
 from coec.errors import ConfigError, ModelError, UsageError, require_readable
+from coec.reports import console
 
 if TYPE_CHECKING:
     from coec.config import Config, OpenPairConfig, PairConfig
@@ -31,7 +32,6 @@ def check_config(
     from coec.config import config_hash, load_config
     from coec.io.zenoh.command_auth import CommandListener, credentials_of
     from coec.io.zenoh.session import check_certificates, settings_of, settings_source
-    from coec.reports import console
     from coec.reports.commented_yaml import commented_yaml
 
     if defaults == (file is not None):

@@ -12,12 +12,14 @@ import typer
 from coec.calibration_options import SolverOptions, configuration_of
 from coec.cli.options import SOURCE_HELP, Depth, Dof, Frames, Json, Objective
 from coec.errors import UsageError
+from coec.reports import console
+from coec.reports.console import StageTimes
+from coec.reports.formatting import count
 
 if TYPE_CHECKING:
     from coec.calibration.baseline import Baseline
     from coec.calibration.types import DepthModel, ImageReader, Window
     from coec.config import CalibrationConfig
-    from coec.reports.console import StageTimes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,11 +60,10 @@ def commission(
 ) -> int:
     """Learn the baseline of a rig from windows in which its calibration is right: bias, spread, every limit."""
     from coec.calibration.commissioning import commission as learn
-    from coec.io.baseline_file import load_baselines, save_baseline
+    from coec.io.rig_files import load_baselines, save_baseline
     from coec.io.user_files import try_file
-    from coec.reports import console, page
+    from coec.reports import page
     from coec.reports.baseline_page import baselines_page
-    from coec.reports.console import StageTimes
     from coec.reports.page_parts import Provenance
 
     serials = _serials_of(sensors or ())
@@ -82,7 +83,7 @@ def commission(
         )
     save_baseline(output, baseline)
     report = page.write(
-        _page_for(output),
+        output.with_suffix(".page.html" if output.suffix == ".html" else ".html"),  # never the baseline itself
         baselines_page(load_baselines(output), baseline.pair, sources, output.name, Provenance.here()),
     )
     if as_json:
@@ -91,11 +92,6 @@ def commission(
         show(baseline)
         console.show(f"written to {output}, with a page of it, {report.name}, beside it")
     return 0
-
-
-def _page_for(path: Path) -> Path:
-    """`rig.html` for `rig.json`; never the baseline itself."""
-    return path.with_suffix(".page.html" if path.suffix == ".html" else ".html")
 
 
 def load(sources: Sequence[str], options: SolverOptions, times: StageTimes) -> RigWindows:
@@ -149,7 +145,7 @@ def document_of(baseline: Baseline) -> dict[str, Any]:
     """What `--json` prints: the baseline as it is written, its hash, and bias and spread in degrees and metres."""
     import numpy as np
 
-    from coec.io.baseline_file import baseline_hash, baseline_to_json
+    from coec.io.rig_files import baseline_hash, baseline_to_json
     from coec.io.serialise import in_degrees
 
     sigma = baseline.accuracy.sigma(baseline.pairs)
@@ -164,9 +160,7 @@ def document_of(baseline: Baseline) -> dict[str, Any]:
 
 def show(baseline: Baseline) -> None:
     """Prints the baseline for people."""
-    from coec.io.baseline_file import baseline_hash
-    from coec.reports import console
-    from coec.reports.formatting import count
+    from coec.io.rig_files import baseline_hash
 
     console.show(
         f"{baseline.pair}: commissioned from {count(baseline.pairs, 'pair')} of "
@@ -178,7 +172,6 @@ def show(baseline: Baseline) -> None:
 def show_learned(baseline: Baseline) -> None:
     """Prints bias, limits, and what the limits detect, as tables."""
     from coec.io.serialise import in_degrees
-    from coec.reports import console
 
     table = console.table("axis", "bias", "± σ", "σ of a check at 6 pairs", "unit", right=(1, 2, 3))
     bias, bias_sigma = in_degrees(baseline.pose.bias), in_degrees(baseline.pose.bias_sigma)
@@ -201,8 +194,6 @@ def show_learned(baseline: Baseline) -> None:
 
 def _show_limits(baseline: Baseline) -> None:
     import numpy as np
-
-    from coec.reports import console
 
     limits = console.table("limit of a check", "value", right=(1,))
     monitor = baseline.monitor

@@ -13,9 +13,10 @@ import typer
 
 from coec.cli.options import Force, Json, Source
 from coec.errors import OutputError, UsageError
+from coec.reports import console
 
 if TYPE_CHECKING:
-    from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
+    from coec.calibration.types import CameraFrame, Frame, Matrix4, Rig
     from coec.config import CalibrationConfig, PairConfig, SweepConfig, WindowConfig
     from coec.io.recordings.layouts import RecordingSource
 
@@ -61,7 +62,6 @@ def convert(
     """Turn a recording into a ROS 2 MCAP, or into a configuration with which `run` serves it."""
     from coec.io import user_files
     from coec.io.recordings.layouts import open_source
-    from coec.reports import console
 
     if out.suffix not in (".mcap", ".yaml", ".yml"):
         raise UsageError(f"{out}: OUT must end in .mcap (ROS 2 bag) or .yaml (daemon configuration)")
@@ -141,7 +141,7 @@ def _calibration(camera: CameraFrame) -> CalibrationConfig:
     return CalibrationConfig() if camera.depth is None else CalibrationConfig(depth=DepthConfig(model=STEREO))
 
 
-def first_frames(recording: RecordingSource) -> list[CameraFrame | LidarFrame | EgoMotion]:
+def first_frames(recording: RecordingSource) -> list[Frame]:
     """The first camera frame, and the frames that are needed to pair it."""
     return list(recording.messages([0]))
 
@@ -181,8 +181,7 @@ def _configuration(recording: RecordingSource, out: Path, *, full: bool, force: 
 
 def _bag(recording: RecordingSource, out: Path) -> list[Path]:
     from coec.calibration.types import CameraFrame
-    from coec.io.mcap.bag_writer import write_bag
-    from coec.reports import console
+    from coec.io.mcap.writer import write_bag
 
     depth = any(isinstance(frame, CameraFrame) and frame.depth is not None for frame in first_frames(recording))
     if depth:

@@ -12,6 +12,8 @@ from coec.calibration_options import SolverOptions
 from coec.cli.commission import RigWindows, load
 from coec.cli.options import Depth, Frames, Json, Source
 from coec.errors import CalibrationError, UsageError
+from coec.reports import console
+from coec.reports.console import StageTimes
 
 if TYPE_CHECKING:
     from coec.calibration.baseline import Baseline
@@ -56,8 +58,7 @@ def diagnose(
     """Check the extrinsic of a recording, as the service does every few seconds: exit 1 if it is wrong or undecided."""
     from coec.calibration.monitor.check_verdict import diagnose as check_extrinsic
     from coec.io.serialise import in_degrees
-    from coec.reports import console, diagnosis
-    from coec.reports.console import StageTimes
+    from coec.reports import diagnosis
 
     experiment = _detection_experiment() if detection > 0 else None
     with console.progress() as bars:
@@ -113,7 +114,7 @@ def _baseline(file: Path | None, window: Window, rigged: RigWindows) -> Baseline
         UsageError: the file has none, or it does not hold for this recording.
     """
     from coec.calibration.baseline import learned_hash, mismatch
-    from coec.io.baseline_file import load_baseline
+    from coec.io.rig_files import load_baseline
 
     if file is None:
         return None
@@ -157,7 +158,7 @@ def _show(seen: Observation, finding: diagnosis.ExtrinsicFinding) -> None:
     from rich.text import Text
 
     from coec.io.serialise import in_degrees, metric_of
-    from coec.reports import console, diagnosis
+    from coec.reports import diagnosis
 
     offset, sigma = in_degrees(seen.offset).tolist(), in_degrees(seen.sigma).tolist()
     axes = console.table("axis", "offset", "± σ", "unit", "f'", "f''", right=(1, 2, 4, 5))

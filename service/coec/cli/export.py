@@ -11,6 +11,7 @@ import typer
 from coec.cli.options import Json, pair_named, suggesting
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.io.exports import NAMES
+from coec.reports import console
 
 if TYPE_CHECKING:
     from coec.calibration.types import Matrix4
@@ -76,7 +77,6 @@ def export(
     from coec.io import user_files as files
     from coec.io.exported_extrinsic import ExportFrames
     from coec.recording import export_text, require_accepted, require_format
-    from coec.reports import console
 
     require_format(format)
     frames = ExportFrames(parent, child, _pose(parent_pose))
@@ -110,7 +110,7 @@ def _read(source: Path, config: Path | None, pair: str | None, frames: ExportFra
 
 def _of_window(path: Path, frames: ExportFrames) -> ExportedExtrinsic:
     from coec.io.exported_extrinsic import extrinsic_of_result
-    from coec.io.mcap.window_reader import read_result, read_window
+    from coec.io.mcap.windows import read_result, read_window
     from coec.io.rig_files import intrinsics_config
 
     result = read_result(path)

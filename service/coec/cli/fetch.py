@@ -20,13 +20,14 @@ from coec import __version__
 from coec.cli.options import Connect, Json, Prefix, SessionFile, service_address
 from coec.cli.query import OF_PAIR
 from coec.errors import CoecError, DecodeError, NotFoundError, OutputError, RemoteError, UsageError, WindowError
+from coec.reports import console
+from coec.schemas.keys import Keys
 
 if TYPE_CHECKING:
     import zenoh
 
-    from coec.io.zenoh.window_fetch import RecordingInfo
+    from coec.io.zenoh.query_client import RecordingInfo
     from coec.schemas.documents import Absent, FetchedFile, FetchedWindow, IncidentReport
-    from coec.schemas.keys import Keys
     from coec.schemas.message import Message
     from coec.schemas.replies import ChainedEntry, EvidenceEvent, HistoryReply, WindowsReply
 
@@ -94,8 +95,7 @@ def fetch(
     The same command resumes an interrupted download.
     """
     from coec.io.zenoh.query_client import connected_by
-    from coec.reports import console, incident_page
-    from coec.schemas.keys import Keys
+    from coec.reports import incident_page
 
     if not VEHICLE.fullmatch(vehicle):
         raise UsageError(f"{vehicle!a} is not a valid name of a vehicle")
@@ -165,7 +165,7 @@ def _is_of(event: EvidenceEvent, vehicle: str, pair: str) -> bool:
 
 
 def _list(events: Sequence[EvidenceEvent], vehicle: str, *, as_json: bool) -> int:
-    from coec.reports import console, replies
+    from coec.reports import replies
     from coec.schemas.message import to_json
     from coec.schemas.replies import EvidenceReply
 
@@ -326,8 +326,7 @@ class Download:
             self.absent.append(Absent(what=f"{len(near) - MAX_SNIPPETS} snippets", why=f"{why}; {how}"))
 
     def _recording(self, recording_id: str) -> RecordingInfo | None:
-        from coec.io.zenoh.window_fetch import fetch_window
-        from coec.reports import console
+        from coec.io.zenoh.query_client import fetch_window
         from coec.schemas.documents import Absent, FetchedFile
 
         if (named := OF_PAIR.fullmatch(recording_id)) is None or named["pair"] != self.pair:
@@ -434,7 +433,7 @@ def _around(key: str, event: EvidenceEvent) -> str:
 
 
 def _in_history(path: Path, window_id: str, history: HistoryReply | None) -> bool | None:
-    from coec.io.mcap.window_reader import read_result
+    from coec.io.mcap.windows import read_result
     from coec.schemas.message import SCHEMA_VERSION
 
     entries = () if history is None else history.entries

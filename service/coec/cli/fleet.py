@@ -11,10 +11,13 @@ import typer
 from coec.cli.commission import document_of, show_learned
 from coec.cli.options import Json
 from coec.errors import DecodeError, UsageError
+from coec.reports import console
+from coec.reports.console import figure
+from coec.reports.formatting import count
 
 if TYPE_CHECKING:
     from coec.calibration.baseline import Baseline
-    from coec.schemas.fleet import FleetNow, FleetReport
+    from coec.schemas.documents import FleetNow, FleetReport
 
 app = typer.Typer(no_args_is_help=True, help="Combine results of many vehicles.")
 
@@ -41,7 +44,7 @@ def report(
     """Report drift of every pair, what is refused and why, and what an earlier batch decided otherwise."""
     from coec.fleet import report as fleet_report
     from coec.io import user_files as files
-    from coec.reports import console, fleet_page, page
+    from coec.reports import fleet_page, page
     from coec.reports.page_parts import Provenance
     from coec.schemas.message import to_json
 
@@ -64,10 +67,8 @@ def report(
 
 
 def _show(summary: FleetReport) -> None:
-    from coec.reports import console, fleet_page
-    from coec.reports.console import figure
-    from coec.reports.formatting import count
-    from coec.schemas.fleet import AXES
+    from coec.reports import fleet_page
+    from coec.schemas.documents import AXES
 
     console.show(fleet_page.sentence(summary))
     table = console.table(
@@ -99,7 +100,7 @@ def _show(summary: FleetReport) -> None:
 
 
 def _fleet_now(path: Path) -> FleetNow:
-    from coec.schemas.fleet import FleetNow
+    from coec.schemas.documents import FleetNow
     from coec.schemas.message import from_json
 
     try:
@@ -111,14 +112,13 @@ def _fleet_now(path: Path) -> FleetNow:
 
 
 def _show_sql(results: Path) -> None:
-    from coec.fleet import tables
-    from coec.reports import console
+    from coec.fleet.report import EXAMPLE_QUERIES, WINDOWS_VIEW, columns, view_statement
 
-    console.write(f"-- the view `{tables.WINDOWS_VIEW}` of the examples below\n")
-    console.write(f"{tables.view_statement(tables.WINDOWS_VIEW, results)};\n\n")
-    for name, kind in tables.columns(results):
+    console.write(f"-- the view `{WINDOWS_VIEW}` of the examples below\n")
+    console.write(f"{view_statement(WINDOWS_VIEW, results)};\n\n")
+    for name, kind in columns(results):
         console.write(f"--   {name:<22} {kind}\n")
-    for question, query in tables.EXAMPLE_QUERIES.items():
+    for question, query in EXAMPLE_QUERIES.items():
         console.write(f"\n-- {question}{query};\n")
 
 
@@ -137,8 +137,7 @@ def commission(
 ) -> int:
     """Learn from commissioned vehicles what others of their model start from (`state.model`): bias, spread, limits."""
     from coec.calibration.baseline import model_baseline
-    from coec.io.baseline_file import load_baselines, save_baseline
-    from coec.reports import console
+    from coec.io.rig_files import load_baselines, save_baseline
 
     vehicles = [load_baselines(path) for path in _each_once(baselines)]
     for path, pairs in zip(baselines, vehicles, strict=True):
@@ -167,9 +166,6 @@ def _each_once(paths: Sequence[Path]) -> Sequence[Path]:
 
 
 def _show_model(model: Baseline, vehicles: int) -> None:
-    from coec.reports import console
-    from coec.reports.formatting import count
-
     console.show(
         f"{model.pair}: {count(vehicles, 'vehicle')}, {count(model.pairs, 'pair')} of {count(model.windows, 'window')}"
     )

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from coec.cli.options import Json
+from coec.reports import console
+from coec.reports.formatting import count
 
 if TYPE_CHECKING:
     import numpy as np
@@ -41,7 +43,6 @@ def lidars(
     from coec.io.nearest_neighbours import Trees
     from coec.io.recordings.layouts import open_lidars
     from coec.io.serialise import in_degrees
-    from coec.reports import console
 
     search = Trees()
     recording = open_lidars(source, a, b)
@@ -62,8 +63,6 @@ def lidars(
 
 def _show(recording: LidarRecording, edge: LidarEdge, error: np.ndarray | None) -> None:
     from coec.io.serialise import in_degrees
-    from coec.reports import console
-    from coec.reports.formatting import count
 
     table = console.table("axis of " + edge.rig.a, "correction", "sigma", *(["error"] if error is not None else []))
     rows = zip(console.AXES, console.UNITS, in_degrees(edge.correction), in_degrees(edge.sigma), strict=True)

@@ -7,6 +7,7 @@ import typer
 
 from coec.cli.options import Force, Json
 from coec.errors import ModelError
+from coec.reports import console
 
 app = typer.Typer(
     help="Depth networks: list the known ones and whose file is present, add a file, show its card, assess it."
@@ -26,7 +27,6 @@ def show(
     """Show the model card with which a network file is run."""
     from coec.io.depth.model_cards import find_card
     from coec.io.depth.onnx_network import file_identity
-    from coec.reports import console
 
     if not file.is_file():
         raise ModelError(f"there is no file {file}")
@@ -54,7 +54,6 @@ def add(
 ) -> int:
     """Copy the file of a known depth network to where this user's services load it, after checking it."""
     from coec.io.depth import depth_maps
-    from coec.reports import console
 
     card, place, copied = depth_maps.add_network(file, name, force=force)
     if as_json:
@@ -71,7 +70,6 @@ def _list(*, as_json: bool) -> int:
     from coec.io.depth import depth_maps
     from coec.io.depth.depth_maps import models_folder
     from coec.io.depth.model_cards import list_models
-    from coec.reports import console
 
     cards = list_models()
     folder = models_folder()

@@ -23,6 +23,7 @@ import typer
 
 from coec.calibration_options import Entry, entries
 from coec.errors import ExitCode, UsageError
+from coec.reports import console
 
 if TYPE_CHECKING:
     from coec.calibration.types import Mistake, Rig
@@ -180,8 +181,7 @@ def show_correction(manifest: Path, mistake: Mistake, rig: Rig) -> None:
     Raises:
         OutputError: it cannot be written.
     """
-    from coec.io.recordings.manifest_correction import write_corrected
-    from coec.reports import console
+    from coec.io.recordings.manifest import write_corrected
 
     correction = write_corrected(manifest, mistake, rig.camera, rig.T_camera_lidar_nominal)
     console.say(f"coec: written {correction.path}: {'; '.join(correction.changes)}")
@@ -211,9 +211,8 @@ def service_address(
         ConfigError: the configuration, or the Zenoh configuration, cannot be read.
     """
     from coec.config import Config, ZenohConfig, load_config
-    from coec.io.zenoh.endpoints import credentials_in, read_settings
     from coec.io.zenoh.query_client import RouterAddress
-    from coec.io.zenoh.session import connected_of
+    from coec.io.zenoh.session import connected_of, credentials_in, read_settings
 
     if config is not None:
         loaded = load_config(config)

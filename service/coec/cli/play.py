@@ -13,6 +13,9 @@ import typer
 
 from coec.cli.options import Connect, Json, Source, until_signal
 from coec.errors import DecodeError, SourceError, UsageError
+from coec.reports import console
+from coec.reports.formatting import count
+from coec.schemas.keys import TF_STATIC
 
 if TYPE_CHECKING:
     from coec.calibration.types import Rig
@@ -334,8 +337,6 @@ def _split(requested: list[str] | None) -> tuple[str, ...]:
 def _select(programme: TopicProgramme, requested: tuple[str, ...], middleware: RosMiddleware) -> dict[str, TopicInfo]:
     """The topics to play: the requested ones, else all that can be played; prints which are left out."""
     from coec.io.zenoh.player import is_playable
-    from coec.reports import console
-    from coec.reports.formatting import count
 
     infos = programme.infos
     unknown = [topic for topic in requested if topic not in infos]
@@ -356,9 +357,6 @@ def _select(programme: TopicProgramme, requested: tuple[str, ...], middleware: R
 
 def _needing_listener(selected: Iterable[str], pair: OpenPairConfig | None) -> list[str]:
     """The topics that need a listener before the first message is sent: those of the configured pair, or all."""
-    from coec.reports import console
-    from coec.schemas.keys import TF_STATIC
-
     ours = [topic for topic in selected if topic != TF_STATIC]
     configured = {stream.topic for stream in pair.streams.values()} if pair is not None else None
     missing = sorted(topic for topic in configured or () if topic is not None and topic not in ours)
@@ -370,7 +368,6 @@ def _needing_listener(selected: Iterable[str], pair: OpenPairConfig | None) -> l
 def _warn(recording: RecordingSource, pair: OpenPairConfig | None, encoding: str) -> None:
     """Prints what the receiver will refuse or miss."""
     from coec.calibration.types import CameraFrame, LidarFrame
-    from coec.reports import console
 
     for frame in recording.messages([0]):
         if isinstance(frame, CameraFrame) and frame.depth is not None and encoding == "cdr":
@@ -389,15 +386,11 @@ def _warn(recording: RecordingSource, pair: OpenPairConfig | None, encoding: str
 
 def _warn_no_depth() -> None:
     """Prints that the depth maps of a recording are not sent with its frames."""
-    from coec.reports import console
-
     console.say("coec: ROS 2 messages carry no depth maps: the service needs a depth network for these frames")
 
 
 def _warn_unsubscribed(streams: list[str]) -> None:
     """Prints which streams have no subscriber."""
-    from coec.reports import console
-
     if streams:
         console.say(f"coec: nobody listens to {', '.join(streams)}; publishing all the same")
 
@@ -426,8 +419,6 @@ def _progress(
     name: str, total: int, pace: Pace, *, counted: tuple[str, ...]
 ) -> Iterator[Callable[[Stamped, Played], None]]:
     """A progress bar to call after each frame; it counts the frames of the streams `counted`, `total` in all."""
-    from coec.reports import console
-
     rate = "as fast as it goes" if pace.rate == 0 else f"× {pace.rate:g}"
     with console.progress() as bars:
         task = bars.add_task(f"{name} {rate}", total=None if pace.loop else total, note="")
@@ -443,8 +434,6 @@ def _progress(
 
 def _report(published: Published, pace: Pace, what: str, *, as_json: bool) -> None:
     """Prints what was published: the number of `what` by stream."""
-    from coec.reports import console
-
     played, elapsed_s = published.played, published.elapsed_s
     if as_json:
         console.print_json(

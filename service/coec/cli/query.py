@@ -14,6 +14,8 @@ import typer
 
 from coec.cli.options import Connect, Json, Prefix, ServiceAddress, ServiceConfig, Vehicle, service_address, suggesting
 from coec.errors import DecodeError, NotFoundError, UsageError
+from coec.reports import console
+from coec.schemas.keys import RIG, VERSION_CHUNK, Keys
 from coec.untrusted import Untrusted
 
 if TYPE_CHECKING:
@@ -82,8 +84,6 @@ class Request:
     @property
     def is_whole(self) -> bool:
         """Whether the key is a whole key expression."""
-        from coec.schemas.keys import VERSION_CHUNK
-
         return f"/{VERSION_CHUNK}/" in self.key
 
 
@@ -241,7 +241,6 @@ def _keys(request: Request, address: ServiceAddress) -> Keys:
         UsageError: something does not fit; the message names it.
     """
     from coec.io.zenoh.query_client import key_expression
-    from coec.schemas.keys import VERSION_CHUNK, Keys
 
     if not math.isfinite(request.timeout_s):
         raise UsageError(f"--timeout {request.timeout_s}: give a number of seconds")
@@ -268,7 +267,6 @@ def _pair_of(session: zenoh.Session, request: Request, keys: Keys, named: str) -
 def _resolve(session: zenoh.Session, request: Request, keys: Keys) -> tuple[str, str | None]:
     """The key expression, and the kind of reply, which decides how it is printed (None: as it comes)."""
     from coec.io.zenoh.query_client import single_key
-    from coec.schemas.keys import RIG
 
     head, _, argument = request.key.partition("/")
     if request.is_whole:
@@ -323,7 +321,6 @@ def _payload(request: Request, arguments: Mapping[str, str | bool | None], paylo
         UsageError: what was given does not fit the command; the message says what does.
     """
     from coec.schemas.commands import COMMAND_NAMES, arguments_of
-    from coec.schemas.keys import RIG
 
     given = {name: value for name, value in arguments.items() if value not in (None, False)}
     chunks = request.key.split("/")
@@ -353,8 +350,6 @@ def _payload(request: Request, arguments: Mapping[str, str | bool | None], paylo
 
 
 def _show(answers: list[Reply], kind: str | None, request: Request, key: str, *, as_json: bool) -> None:
-    from coec.reports import console
-
     if as_json:
         values = [{"key": answer.key, "value": _value(answer)} for answer in answers]
         if "*" in key and request.is_whole:
@@ -385,7 +380,6 @@ def _value(reply: Reply) -> Any:
 
 def _render(reply: Reply, kind: str | None) -> None:
     from coec.io.zenoh.bus import JSON
-    from coec.reports import console
     from coec.reports import replies as tables
 
     shown = tables.BY_KIND.get(kind or "")
@@ -427,7 +421,6 @@ def _save_picture(request: Request, way: RouterAddress, keys: Keys, path: Path, 
     """Saves `overlay`, or `evidence/ID` with `--param overlay=before`, as a JPEG file."""
     from coec.io import user_files as files
     from coec.io.zenoh.query_client import connected_by, query_one, single_key
-    from coec.reports import console
 
     head, _, argument = request.key.partition("/")
     if head not in PICTURE_KEYS or (head == "evidence") != bool(argument):
@@ -455,9 +448,7 @@ def _save_picture(request: Request, way: RouterAddress, keys: Keys, path: Path, 
 def _download(
     request: Request, way: RouterAddress, keys: Keys, window_id: str, output: Path | None, *, force: bool, as_json: bool
 ) -> int:
-    from coec.io.zenoh.query_client import connected_by, single_key
-    from coec.io.zenoh.window_fetch import fetch_window
-    from coec.reports import console
+    from coec.io.zenoh.query_client import connected_by, fetch_window, single_key
 
     if output is None:
         raise UsageError("give the file with --output FILE")

@@ -11,12 +11,15 @@ import typer
 
 from coec.cli.options import Json, Source
 from coec.errors import SourceError, UsageError, WindowError
+from coec.reports import console
+from coec.reports.console import StageTimes
+from coec.reports.formatting import count
 
 if TYPE_CHECKING:
+    from coec.calibration.types import Frame
     from coec.config import Config
-    from coec.io.recordings.recording_source import RecordingSource, SensorMessage
-    from coec.service.decision_log import Difference
-    from coec.service.drive_replay import ReplayedDrive
+    from coec.io.recordings.recording_source import RecordingSource
+    from coec.service.drive_replay import Difference, ReplayedDrive
 
 NS_PER_S = 1_000_000_000
 
@@ -92,7 +95,7 @@ def replay(
 def _is_window(path: Path, *, alone: bool) -> bool:
     """Whether this is the file of a window, with or without a result. A damaged file counts as one if it is given
     `alone`, without an option that applies to drives."""
-    from coec.io.mcap.window_reader import is_window
+    from coec.io.mcap.windows import is_window
 
     if path.suffix != ".mcap" or not path.is_file():
         return False
@@ -107,12 +110,10 @@ def _replay_window(window: Path, depth: str | None, *, as_json: bool) -> int:
     from coec.config import LimitsConfig
     from coec.io.depth.depth_maps import open_depth
     from coec.io.images import GreyImages
-    from coec.io.mcap.window_reader import read_result, read_window
+    from coec.io.mcap.windows import read_result, read_window
     from coec.io.serialise import comparable, result_of
-    from coec.reports import console
-    from coec.reports.console import StageTimes
     from coec.schemas.message import to_json
-    from coec.service.decision_log import value_differences
+    from coec.service.drive_replay import value_differences
 
     recorded = read_result(window)
     if recorded is None:
@@ -178,7 +179,6 @@ def _opened(source: str, file: Path | None, name: str | None, depth: str | None)
 def _replay_drive(recording: RecordingSource, config: Config, begin_s: float, until_s: float | None) -> ReplayedDrive:
     from tempfile import TemporaryDirectory
 
-    from coec.reports import console
     from coec.service.drive_replay import DriveReplay
 
     if not recording.camera_stamps_ns:
@@ -189,7 +189,7 @@ def _replay_drive(recording: RecordingSource, config: Config, begin_s: float, un
     if begin_ns > min(end_ns, recording.camera_stamps_ns[-1]):
         raise UsageError(f"no camera frame lies between --from and --until: {recording.name} is shorter")
 
-    def frames() -> Iterator[SensorMessage]:
+    def frames() -> Iterator[Frame]:
         # Motion before the first image and after the last one belongs to them.
         for frame in recording.messages():
             if until_s is not None and frame.stamp_ns > end_ns:
@@ -211,8 +211,7 @@ def _show_drive(
     explain_s: float | None,
     as_json: bool,
 ) -> int:
-    from coec.reports import console
-    from coec.service.decision_log import differences, read_log, write_log
+    from coec.service.drive_replay import differences, read_log, write_log
 
     log, against, report = files
     first_ns = recording.camera_stamps_ns[0]
@@ -223,7 +222,7 @@ def _show_drive(
     if log is not None:
         write_log(log, replayed.decisions)
     if report is not None:
-        from coec.service.replay_page import write_replay_page
+        from coec.service.drive_replay import write_replay_page
 
         write_replay_page(report, recording.name, replayed, first_ns, None if against is None else differing)
     if as_json:
@@ -268,9 +267,7 @@ def _document(replayed: ReplayedDrive, differing: tuple[Difference, ...] | None)
 
 def _table(replayed: ReplayedDrive, first_ns: int) -> None:
     """Prints what was decided, without the checks that changed nothing."""
-    from coec.reports import console
-    from coec.reports.formatting import count
-    from coec.service.replay_page import outline
+    from coec.service.drive_replay import outline
 
     checks = [one for one in replayed.decisions if one.kind == "check"]
     windows = [one for one in replayed.decisions if one.kind == "estimate"]
@@ -288,9 +285,6 @@ def _table(replayed: ReplayedDrive, first_ns: int) -> None:
 
 
 def _show_differences(differing: tuple[Difference, ...], against: Path, first_ns: int) -> None:
-    from coec.reports import console
-    from coec.reports.formatting import count
-
     if not differing:
         console.show(f"equal to {against}", "bold green")
         return
@@ -310,8 +304,6 @@ def _show_differences(differing: tuple[Difference, ...], against: Path, first_ns
 
 def _explain(replayed: ReplayedDrive, first_ns: int, moment_s: float) -> None:
     """Prints the steps of the engine around a moment of the drive."""
-    from coec.reports import console
-
     table = console.table("s", "event", "actions", "health")
     for one in replayed.transitions:
         at_s = (one.stamp_ns - first_ns) / NS_PER_S

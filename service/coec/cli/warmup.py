@@ -11,9 +11,11 @@ import typer
 
 from coec.cli.options import Json
 from coec.errors import OutputError, UsageError
+from coec.reports import console
+from coec.reports.console import StageTimes
 
 if TYPE_CHECKING:
-    from coec.config import OpenPairConfig, PairConfig
+    pass
 
 SIZE = {"width": 160, "height": 120, "fx": 60.0, "fy": 60.0, "cx": 79.5, "cy": 59.5}
 """Kernels are compiled for types, not for sizes."""
@@ -47,7 +49,6 @@ def warmup(
     again.
     """
     from coec.geometry.compiler import kernel_cache
-    from coec.reports import console
 
     models = _lens_models(config, lenses)
     folder, is_writable = kernel_cache()
@@ -78,23 +79,16 @@ def _lens_models(config: Path | None, lenses: Sequence[str] | None) -> list[str]
     if unknown := sorted(named - set(MODELS)):
         raise UsageError(f"--lens {unknown[0]}: unknown; known are {', '.join(MODELS)}")
     if config is not None:
-        models = set(map(_lens_model, load_config(config).every_pair))
+        lenses_of_pairs = (pair.camera.intrinsics for pair in load_config(config).every_pair)
+        models = {None if lens is None else lens.model for lens in lenses_of_pairs}  # None: of a `CameraInfo` to come
         named = set(MODELS) if None in models else {lens for lens in models if lens is not None}
     return [lens for lens in MODELS if lens in named]
-
-
-def _lens_model(pair: PairConfig | OpenPairConfig) -> str | None:
-    """The lens model of a pair; None if it is to come from `CameraInfo`."""
-    intrinsics = pair.camera.intrinsics
-    return None if intrinsics is None else intrinsics.model
 
 
 def _compile(lenses: Sequence[str]) -> int:
     """Runs every kernel once; returns how many there are."""
     from coec.config import Config
     from coec.geometry import compilation_events
-    from coec.reports import console
-    from coec.reports.console import StageTimes
     from coec.service.worker.compilation import compiled
     from coec.service.worker.second_compiler import second_compiler
     from coec.service.worker.tasks import Solver

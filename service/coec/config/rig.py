@@ -14,8 +14,7 @@ from typing import Annotated, Any, Self, TypeVar
 from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
 from coec.config.model import IDENTITY, MAX_NAME, ConfigModel, Name, describe
-from coec.config.pair import OpenCameraConfig, OpenEgoConfig, OpenLidarConfig
-from coec.config.pose_forms import Pose
+from coec.config.pair import OpenCameraConfig, OpenEgoConfig, OpenLidarConfig, Pose
 from coec.config.stages import (
     CalibrationConfig,
     MonitorConfig,

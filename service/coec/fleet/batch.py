@@ -14,13 +14,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from coec.errors import DecodeError, OutputError, UsageError
-from coec.fleet import tables
 from coec.fleet.evaluator import ReplaySettings
 from coec.fleet.jobs import Job
-from coec.fleet.tables import optional_library
+from coec.fleet.report import optional_library, tabulated_urls, write_tables
 from coec.fleet.worker_pool import Engine
 from coec.io import storage, user_files
-from coec.schemas.fleet import BatchReport, WindowRow
+from coec.schemas.documents import BatchReport, WindowRow
 from coec.schemas.message import from_json, to_json
 
 SETTINGS_FILE, JOURNAL_FILE = "terms.json", "journal.jsonl"
@@ -44,7 +43,7 @@ class BatchFolder:
         self._folder = folder
         optional_library("pyarrow.parquet")  # before anything is written
         self._open(settings, resume=resume)
-        self._written = tables.tabulated_urls(folder)
+        self._written = tabulated_urls(folder)
         self._rows: list[WindowRow] = []
         self._journal = storage.LineLog(folder / JOURNAL_FILE, 2 * ROWS_A_FILE, self._lines)
         with self._writing(folder / JOURNAL_FILE):
@@ -81,7 +80,7 @@ class BatchFolder:
         # The name depends on the rows in the file, so that no file replaces one with other rows.
         urls = [row.url for row in self._rows]
         name = hashlib.sha256("\n".join(sorted(urls)).encode()).hexdigest()[:16]
-        tables.write_tables(self._folder, self._rows, f"part-{name}")
+        write_tables(self._folder, self._rows, f"part-{name}")
         self._written.update(urls)
         self._rows = []
         with self._writing(self._folder / JOURNAL_FILE):

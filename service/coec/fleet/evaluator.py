@@ -23,11 +23,11 @@ from coec.errors import CoecError, ConfigError, SourceError, UsageError, WindowE
 from coec.fleet.jobs import Job, empty_row, failed_row, fetched_window, sha256_of
 from coec.io.depth.depth_maps import open_depth
 from coec.io.images import GreyImages
-from coec.io.mcap.window_reader import read_result, read_vehicle, read_window
+from coec.io.mcap.windows import read_result, read_vehicle, read_window
 from coec.io.rig_files import rig_from_json, rig_to_json
 from coec.io.serialise import comparable, result_of
 from coec.reports.page_parts import versions
-from coec.schemas.fleet import WindowRow
+from coec.schemas.documents import WindowRow
 from coec.schemas.message import to_json
 from coec.schemas.replies import CalibrationResult
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Final, get_args
 
 from coec.errors import DecodeError
-from coec.schemas.fleet import SEEN, Connectivity, FleetNow, PairNow
+from coec.schemas.documents import SEEN, Connectivity, FleetNow, PairNow
 from coec.schemas.heartbeat import LastWord, decode_heartbeat
 from coec.schemas.replies import HealthState
 

@@ -22,7 +22,7 @@ from urllib.parse import urlsplit
 
 from coec import __version__
 from coec.errors import SourceError, UsageError
-from coec.schemas.fleet import WindowRow
+from coec.schemas.documents import WindowRow
 
 GOOGLE = "GOOGLE_APPLICATION_CREDENTIALS"
 """Environment variable with the path of a file of credentials. Nodes get the content of the file."""

@@ -21,7 +21,7 @@ from typing import Protocol
 from coec.errors import CoecError, ModelError
 from coec.fleet.evaluator import ReplaySettings
 from coec.fleet.jobs import Job, StoreError, lost_row
-from coec.schemas.fleet import WindowRow
+from coec.schemas.documents import WindowRow
 
 PROCESS_DIED, DEADLINE, TOO_LARGE = "process_died", "deadline", "memory_exceeded"
 """Error codes of windows whose process ended or was ended."""

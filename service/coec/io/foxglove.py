@@ -12,16 +12,6 @@ from coec.errors import UnavailableError
 from coec.geometry.cameras import Camera
 from coec.geometry.se3 import inverse, quaternion_xyzw_from_rotation
 from coec.io import viewer_scene
-from coec.io.viewer_scene import (
-    DisplayedPose,
-    PairPicture,
-    PointMarks,
-    TimelineEntry,
-    ViewerCamera,
-    frame_of,
-    timeline_schema,
-    viewer_camera,
-)
 
 NS_PER_S = 1_000_000_000
 
@@ -63,13 +53,13 @@ class ViewerServer:
         }
         self._cloud = channels.PointCloudChannel(viewer_scene.CLOUD_TOPIC, context=context)
         self._transforms = channels.FrameTransformsChannel(viewer_scene.TRANSFORMS_TOPIC, context=context)
-        self._counterpart = viewer_camera(camera)
+        self._counterpart = viewer_scene.viewer_camera(camera)
         self._calibration = (
             None
             if self._counterpart is None
             else channels.CameraCalibrationChannel(viewer_scene.CALIBRATION_TOPIC, context=context)
         )
-        self._health = Channel(viewer_scene.HEALTH_TOPIC, schema=timeline_schema(), context=context)
+        self._health = Channel(viewer_scene.HEALTH_TOPIC, schema=viewer_scene.timeline_schema(), context=context)
         self._log = channels.LogChannel(viewer_scene.LOG_TOPIC, context=context)
         always = (self._image, *self._marks.values(), self._cloud, self._transforms, self._health, self._log)
         self._all = always if self._calibration is None else (*always, self._calibration)
@@ -87,12 +77,12 @@ class ViewerServer:
         """Topics that some viewer subscribes to."""
         return frozenset(str(channel.topic()) for channel in self._all if channel.has_sinks())
 
-    def send_picture(self, picture: PairPicture) -> None:
+    def send_picture(self, picture: viewer_scene.PairPicture) -> None:
         """Send all parts of a picture, with the stamp of its image."""
         stamp = _stamp(picture.stamp_ns)
         if picture.image is not None:
             self._image.log(_image(picture, picture.image, stamp))
-        for row, pose in enumerate(DisplayedPose):
+        for row, pose in enumerate(viewer_scene.DisplayedPose):
             if pose in picture.marks:
                 self._marks[pose].log(_annotations(picture.marks[pose], row, picture.rig.camera.width, stamp))
         if picture.cloud is not None:
@@ -101,7 +91,7 @@ class ViewerServer:
         if self._calibration is not None and self._counterpart is not None:
             self._calibration.log(_calibration(picture, self._counterpart, stamp))
 
-    def send_entry(self, moment: TimelineEntry) -> None:
+    def send_entry(self, moment: viewer_scene.TimelineEntry) -> None:
         """Send a line of the timeline."""
         self._health.log(moment.document())
 
@@ -123,12 +113,16 @@ def _stamp(stamp_ns: int) -> messages.Timestamp:
     return messages.Timestamp(*divmod(stamp_ns, NS_PER_S))
 
 
-def _image(picture: PairPicture, image: EncodedImage, stamp: messages.Timestamp) -> messages.CompressedImage:
-    frame = frame_of(picture.rig.camera_frame, DisplayedPose.SERVED)
+def _image(
+    picture: viewer_scene.PairPicture, image: EncodedImage, stamp: messages.Timestamp
+) -> messages.CompressedImage:
+    frame = viewer_scene.frame_of(picture.rig.camera_frame, viewer_scene.DisplayedPose.SERVED)
     return messages.CompressedImage(timestamp=stamp, frame_id=frame, data=image.data, format=str(image.format))
 
 
-def _annotations(marks: PointMarks, row: int, width_px: int, stamp: messages.Timestamp) -> messages.ImageAnnotations:
+def _annotations(
+    marks: viewer_scene.PointMarks, row: int, width_px: int, stamp: messages.Timestamp
+) -> messages.ImageAnnotations:
     """Points and a line of text. The text is sent even if no point is in view, because viewers wait for annotations
     with the stamp of the image."""
     size_px = max(8.0, width_px * TITLE_SHARE)
@@ -153,7 +147,7 @@ def _annotations(marks: PointMarks, row: int, width_px: int, stamp: messages.Tim
     return messages.ImageAnnotations(timestamp=stamp, points=points, texts=[title])
 
 
-def _cloud(picture: PairPicture, cloud: np.ndarray, stamp: messages.Timestamp) -> messages.PointCloud:
+def _cloud(picture: viewer_scene.PairPicture, cloud: np.ndarray, stamp: messages.Timestamp) -> messages.PointCloud:
     names = ("x", "y", "z", "range")
     kind = messages.PackedElementFieldNumericType.Float32
     fields = [
@@ -172,7 +166,7 @@ def _cloud(picture: PairPicture, cloud: np.ndarray, stamp: messages.Timestamp) -
     )
 
 
-def _transforms(picture: PairPicture, stamp: messages.Timestamp) -> messages.FrameTransforms:
+def _transforms(picture: viewer_scene.PairPicture, stamp: messages.Timestamp) -> messages.FrameTransforms:
     return messages.FrameTransforms(
         transforms=[
             _pose_in_lidar(picture, pose, extrinsic.T_camera_lidar, stamp)
@@ -183,7 +177,10 @@ def _transforms(picture: PairPicture, stamp: messages.Timestamp) -> messages.Fra
 
 
 def _pose_in_lidar(
-    picture: PairPicture, pose: DisplayedPose, T_camera_lidar: np.ndarray, stamp: messages.Timestamp
+    picture: viewer_scene.PairPicture,
+    pose: viewer_scene.DisplayedPose,
+    T_camera_lidar: np.ndarray,
+    stamp: messages.Timestamp,
 ) -> messages.FrameTransform:
     """The transform of a camera frame: the pose of the child in the parent, which is the inverse of T_camera_lidar."""
     T_lidar_camera = inverse(T_camera_lidar)
@@ -192,19 +189,19 @@ def _pose_in_lidar(
     return messages.FrameTransform(
         timestamp=stamp,
         parent_frame_id=picture.rig.lidar_frame,
-        child_frame_id=frame_of(picture.rig.camera_frame, pose),
+        child_frame_id=viewer_scene.frame_of(picture.rig.camera_frame, pose),
         translation=messages.Vector3(x=x, y=y, z=z),
         rotation=messages.Quaternion(x=qx, y=qy, z=qz, w=qw),
     )
 
 
 def _calibration(
-    picture: PairPicture, counterpart: ViewerCamera, stamp: messages.Timestamp
+    picture: viewer_scene.PairPicture, counterpart: viewer_scene.ViewerCamera, stamp: messages.Timestamp
 ) -> messages.CameraCalibration:
     camera = counterpart.camera
     return messages.CameraCalibration(
         timestamp=stamp,
-        frame_id=frame_of(picture.rig.camera_frame, DisplayedPose.SERVED),
+        frame_id=viewer_scene.frame_of(picture.rig.camera_frame, viewer_scene.DisplayedPose.SERVED),
         width=camera.width,
         height=camera.height,
         distortion_model=counterpart.distortion_model,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame
+from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, Frame, ImageFormat, LidarFrame
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
 from coec.io.frame_validation import Refusal, check_size, lidar_frame
@@ -83,6 +83,17 @@ def decode_ego(payload: bytes, limits: LimitsConfig) -> EgoMotion:
     """
     wire = _read(frames.EgoMotion, payload, limits)
     return EgoMotion(wire.stamp_ns, wire.frame_id, wire.linear_mps, wire.angular_radps, wire.sequence)
+
+
+def encode(frame: Frame) -> bytes:
+    """The message of a frame of any sensor."""
+    match frame:
+        case CameraFrame():
+            return encode_camera(frame)
+        case LidarFrame():
+            return encode_lidar(frame)
+        case EgoMotion():
+            return encode_ego(frame)
 
 
 def encode_camera(frame: CameraFrame) -> bytes:

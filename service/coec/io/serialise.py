@@ -11,31 +11,16 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration import types
 from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.state import PairState
 from coec.calibration.state_machine import step_between
-from coec.calibration.types import (
-    CueShare,
-    Decision,
-    Estimate,
-    LensEstimate,
-    Matrix4,
-    Metric,
-    Mistake,
-    MovedWithin,
-    Optimum,
-    Reason,
-    Rig,
-    StopReason,
-    Uncertainty,
-    Verdict,
-)
 from coec.geometry import cameras
 from coec.geometry.se3 import quaternion_xyzw_from_rotation
 from coec.schemas import replies
 
 
-def transform_of(T: Matrix4) -> replies.Transform:
+def transform_of(T: types.Matrix4) -> replies.Transform:
     """The wire form of a rigid (4, 4) transform; its matrix holds the same doubles."""
     rows = tuple(tuple(float(v) for v in row) for row in T)
     return replies.Transform(
@@ -45,7 +30,7 @@ def transform_of(T: Matrix4) -> replies.Transform:
     )
 
 
-def matrix_of(transform: replies.Transform) -> Matrix4:
+def matrix_of(transform: replies.Transform) -> types.Matrix4:
     """(4, 4) float64, the same doubles."""
     return np.array(transform.matrix, dtype=np.float64)
 
@@ -73,7 +58,7 @@ _LENS_TERMS: Mapping[str, Literal["px", "share"]] = {
 """Unit of each term of the wire form of a `LensEstimate`, in its order."""
 
 
-def lens_of(lens: LensEstimate, camera: cameras.Camera) -> replies.Lens:
+def lens_of(lens: types.LensEstimate, camera: cameras.Camera) -> replies.Lens:
     """The wire form of what a window says of the lens of a camera; its differences are the same doubles."""
     terms = {
         name: replies.LensTerm(
@@ -94,9 +79,9 @@ def lens_of(lens: LensEstimate, camera: cameras.Camera) -> replies.Lens:
     )
 
 
-def _lens_estimate(lens: replies.Lens) -> LensEstimate:
+def _lens_estimate(lens: replies.Lens) -> types.LensEstimate:
     terms: list[replies.LensTerm] = [getattr(lens, name) for name in _LENS_TERMS]
-    return LensEstimate(
+    return types.LensEstimate(
         difference=np.array([term.difference for term in terms]),
         sigma=np.array([term.sigma for term in terms]),
         free_difference=np.array([term.free_difference for term in terms]),
@@ -106,7 +91,7 @@ def _lens_estimate(lens: replies.Lens) -> LensEstimate:
     )
 
 
-def result_of(estimate: Estimate, rig: Rig, vehicle: str) -> replies.CalibrationResult:
+def result_of(estimate: types.Estimate, rig: types.Rig, vehicle: str) -> replies.CalibrationResult:
     """The wire form of an estimate, complete. NaN becomes null, infinity the largest double."""
     optimum, uncertainty = estimate.optimum, estimate.uncertainty
     return replies.CalibrationResult(
@@ -131,7 +116,7 @@ def result_of(estimate: Estimate, rig: Rig, vehicle: str) -> replies.Calibration
         independent_looks=number_or_null(uncertainty.independent_samples),
         solved=cast("replies.Flags6", tuple(bool(v) for v in estimate.solved)),
         unobservable=cast("replies.Flags6", tuple(bool(v) for v in estimate.unobservable)),
-        status="accepted" if estimate.verdict.decision is Decision.ACCEPTED else "failed",
+        status="accepted" if estimate.verdict.decision is types.Decision.ACCEPTED else "failed",
         verdict=replies.Verdict(
             decision=estimate.verdict.decision.value,
             reasons=tuple(replies.Reason(code=r.code, text=r.text) for r in estimate.verdict.reasons),
@@ -156,13 +141,13 @@ def result_of(estimate: Estimate, rig: Rig, vehicle: str) -> replies.Calibration
     )
 
 
-def _cue_of(cue: CueShare) -> replies.Cue:
+def _cue_of(cue: types.CueShare) -> replies.Cue:
     return replies.Cue(
         samples=cue.samples, weight=cue.weight, significance=number_or_null(cue.significance), share=_maybe6(cue.share)
     )
 
 
-def mistake_of(mistake: Mistake) -> replies.ProbableMistake:
+def mistake_of(mistake: types.Mistake) -> replies.ProbableMistake:
     """The wire form of a mistake in the inputs."""
     return replies.ProbableMistake(
         code=mistake.code,
@@ -185,7 +170,7 @@ def comparable(reached: replies.CalibrationResult, recorded: replies.Calibration
     return reached.model_copy(update=changes)
 
 
-def _moved_of(moved: MovedWithin) -> replies.MovedWithin:
+def _moved_of(moved: types.MovedWithin) -> replies.MovedWithin:
     return replies.MovedWithin(
         last_before_ns=moved.last_before_ns,
         first_after_ns=moved.first_after_ns,
@@ -195,13 +180,13 @@ def _moved_of(moved: MovedWithin) -> replies.MovedWithin:
     )
 
 
-def estimate_of(result: replies.CalibrationResult) -> Estimate:
+def estimate_of(result: replies.CalibrationResult) -> types.Estimate:
     """The estimate that `result_of` wrote, with the same doubles; metrics are sorted by name."""
-    return Estimate(
+    return types.Estimate(
         window_id=result.window_id,
         data_stamp_ns=result.data_stamp_ns,
         pairs=result.pairs,
-        optimum=Optimum(
+        optimum=types.Optimum(
             T_camera_lidar=matrix_of(result.camera_from_lidar),
             score=_or_nan(result.score),
             score_at_start=_or_nan(result.score_at_start),
@@ -209,20 +194,20 @@ def estimate_of(result: replies.CalibrationResult) -> Estimate:
             overlap=_or_nan(result.overlap),
             points_in_view=result.points_in_view,
             evaluations=result.evaluations,
-            stop_reason=StopReason(result.stop_reason),
+            stop_reason=types.StopReason(result.stop_reason),
             first_derivative=_array(result.first_derivative),
             second_derivative=_array(result.second_derivative),
         ),
-        verdict=Verdict(
-            decision=Decision(result.verdict.decision),
+        verdict=types.Verdict(
+            decision=types.Decision(result.verdict.decision),
             metrics=tuple(
-                Metric(name, _or_nan(metric.value), _limit_of(metric), metric.at_least)
+                types.Metric(name, _or_nan(metric.value), _limit_of(metric), metric.at_least)
                 for name, metric in sorted(result.metrics.items())
             ),
-            reasons=tuple(Reason(reason.code, reason.text) for reason in result.verdict.reasons),
+            reasons=tuple(types.Reason(reason.code, reason.text) for reason in result.verdict.reasons),
         ),
         correction=_array(result.correction_rad_m),
-        uncertainty=Uncertainty(
+        uncertainty=types.Uncertainty(
             noise=np.array([_array(row) for row in result.noise]),
             systematic={name: np.array(shift) for name, shift in result.systematic.items()},
             independent_samples=_or_nan(result.independent_looks),
@@ -235,14 +220,14 @@ def estimate_of(result: replies.CalibrationResult) -> Estimate:
         moved=None if result.moved is None else _moved_within(result.moved),
         lens=None if result.lens is None else _lens_estimate(result.lens),
         cues=tuple(
-            CueShare(name, cue.samples, cue.weight, _or_nan(cue.significance), _array(cue.share))
+            types.CueShare(name, cue.samples, cue.weight, _or_nan(cue.significance), _array(cue.share))
             for name, cue in (result.cues or {}).items()
         ),
     )
 
 
-def _moved_within(moved: replies.MovedWithin) -> MovedWithin:
-    return MovedWithin(
+def _moved_within(moved: replies.MovedWithin) -> types.MovedWithin:
+    return types.MovedWithin(
         moved.last_before_ns,
         moved.first_after_ns,
         moved.pairs_after,
@@ -251,12 +236,12 @@ def _moved_within(moved: replies.MovedWithin) -> MovedWithin:
     )
 
 
-def reasons_of(reasons: tuple[Reason, ...]) -> tuple[replies.Reason, ...]:
+def reasons_of(reasons: tuple[types.Reason, ...]) -> tuple[replies.Reason, ...]:
     """Reasons in their wire form."""
     return tuple(replies.Reason(code=reason.code, text=reason.text) for reason in reasons)
 
 
-def metric_of(metric: Metric) -> replies.MetricReply:
+def metric_of(metric: types.Metric) -> replies.MetricReply:
     """A figure with its limit."""
     return replies.MetricReply(
         value=number_or_null(metric.value),

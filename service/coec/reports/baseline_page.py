@@ -6,7 +6,7 @@ from math import degrees, isfinite
 from coec.calibration.baseline import Baseline
 from coec.calibration.figures import FIGURES
 from coec.config import VerdictConfig
-from coec.io.baseline_file import baseline_hash
+from coec.io.rig_files import baseline_hash
 from coec.reports.formatting import count, number, percent, significant
 from coec.reports.page import Block, Cell, Facts, Page, Section, Table, Text, VerdictBanner
 from coec.reports.page_parts import Provenance, axes_table, finite_degrees

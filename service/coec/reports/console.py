@@ -14,28 +14,21 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from rich import progress as rich_progress
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.highlighter import JSONHighlighter
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    Task,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-)
 from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
 from coec.geometry import compilation_events
 from coec.reports import formatting
-from coec.schemas import replies
 from coec.untrusted import json_printable, printable, printable_lines
+
+if TYPE_CHECKING:
+    from coec.schemas import replies
 
 LINE_S = 30.0
 """Time between two lines without a terminal: the log of an hour has about a hundred."""
@@ -71,18 +64,18 @@ class CompilationProgress:
         return 0.0 if self._began_s is None else self._now_s() - self._began_s
 
 
-class PlainColumn(TextColumn):
+class PlainColumn(rich_progress.TextColumn):
     """A column of text that is shown as it is, on one line: names in it come from recordings and vehicles."""
 
     def __init__(self, text_format: str) -> None:
         super().__init__(text_format, markup=False)
 
-    def render(self, task: Task) -> Text:
+    def render(self, task: rich_progress.Task) -> Text:
         """The text of a task."""
         return Text(printable(self.text_format.format(task=task)))
 
 
-class Bars(Progress):
+class Bars(rich_progress.Progress):
     """A bar for each task that disappears when all is done. Where the console is no terminal, a line on the current
     task every half minute; quicker work gets none."""
 
@@ -105,14 +98,14 @@ class Bars(Progress):
         self._listening: AbstractContextManager[None] = (
             compilation_events.listening(self._on_kernel) if compiling else nullcontext()
         )
-        self._compiling: TaskID | None = None
-        count = (MofNCompleteColumn(),) if counted else ()
+        self._compiling: rich_progress.TaskID | None = None
+        count = (rich_progress.MofNCompleteColumn(),) if counted else ()
         super().__init__(
-            SpinnerColumn("dots" if console.encoding.startswith("utf") else "line"),
+            rich_progress.SpinnerColumn("dots" if console.encoding.startswith("utf") else "line"),
             PlainColumn("{task.description}"),
-            BarColumn(),
+            rich_progress.BarColumn(),
             *count,
-            TimeElapsedColumn(),
+            rich_progress.TimeElapsedColumn(),
             PlainColumn("{task.fields[note]}"),
             console=console,
             transient=True,
@@ -138,13 +131,13 @@ class Bars(Progress):
 
         return on_progress
 
-    def update(self, task_id: TaskID, **changes: Any) -> None:
+    def update(self, task_id: rich_progress.TaskID, **changes: Any) -> None:
         """Updates a task as in rich, and prints a line when it is time."""
         super().update(task_id, **changes)
         if self.disable and self._is_time():
             self._say(f"coec: {self._line(self._tasks[task_id])}")
 
-    def _line(self, task: Task) -> str:
+    def _line(self, task: rich_progress.Task) -> str:
         """What a task does, how far it is if that is counted, and its note."""
         done = f"{task.completed:g}" + ("" if task.total is None else f" of {task.total:g}") if self._counted else ""
         so_far = ", ".join(part for part in (done, task.fields.get("note", "")) if part)
@@ -173,9 +166,9 @@ class Bars(Progress):
 class StageTimes:
     """Progress bars and the seconds that each stage took. A stage ends with its last step."""
 
-    def __init__(self, bars: Progress) -> None:
+    def __init__(self, bars: rich_progress.Progress) -> None:
         self._bars = bars
-        self._tasks: dict[str, TaskID] = {}
+        self._tasks: dict[str, rich_progress.TaskID] = {}
         self._mark_s = self._start_s = time.perf_counter()
         self._elapsed_s: dict[str, float] = {}
 

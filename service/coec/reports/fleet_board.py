@@ -11,7 +11,7 @@ from coec.config import LimitsConfig
 from coec.io.images import decode_bgr, probe
 from coec.reports import console
 from coec.reports.formatting import count
-from coec.schemas.fleet import FleetNow, PairNow
+from coec.schemas.documents import FleetNow, PairNow
 
 KEYS = "↑↓ choose   r reasons   h history   o overlay   f filter   q quit"
 """The keys that can be pressed."""

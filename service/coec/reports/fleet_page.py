@@ -8,7 +8,7 @@ from coec.reports.console import figure
 from coec.reports.formatting import NONE, count, day, percent
 from coec.reports.page import Block, Cell, Page, Section, Table, Text, Trend, VerdictBanner
 from coec.reports.page_parts import Provenance
-from coec.schemas.fleet import AXES, FalseAlarms, FleetChanges, FleetReport, PairOfFleet
+from coec.schemas.documents import AXES, FalseAlarms, FleetChanges, FleetReport, PairOfFleet
 
 NAMES = dict(zip(AXES, ("pitch", "yaw", "roll", "right", "down", "forward"), strict=True))
 LEAST = {"deg": 0.1, "m": 0.02}

@@ -30,23 +30,12 @@ from coec.geometry import se3
 from coec.io.depth.depth_maps import PRECOMPUTED
 from coec.io.depth.model_cards import built_in_cards
 from coec.io.serialise import in_degrees
+from coec.reports import page
 from coec.reports.console import AXIS_NAMES, UNITS
 from coec.reports.formatting import number, second, significant, size
-from coec.reports.page import (
-    AxesTable,
-    AxisLine,
-    Copies,
-    Copy,
-    Facts,
-    FigureLine,
-    Figures,
-    Picture,
-    Section,
-    Tone,
-)
 from coec.schemas.replies import Intrinsics, Maybe6, MetricReply, Reason, Transform
 
-TONES: Mapping[str, Tone] = {
+TONES: Mapping[str, page.Tone] = {
     "accepted": "good",
     "healthy": "good",
     "calibrated": "good",
@@ -96,14 +85,14 @@ CAPTIONS: Mapping[str, tuple[str, str]] = {
 """Alternative text and caption of a picture by the stem of its file."""
 
 
-def file_picture(path: Path) -> Picture:
+def file_picture(path: Path) -> page.Picture:
     """A picture file with its texts from `CAPTIONS`.
 
     Raises:
         OutputError: it can no longer be read.
     """
     alt, caption = CAPTIONS[path.stem]
-    return Picture(read(path), alt, caption)
+    return page.Picture(read(path), alt, caption)
 
 
 def read(path: Path) -> bytes:
@@ -130,7 +119,7 @@ def axes_table(
     sigmas: Sequence[float | None],
     labels: Mapping[int, str] | None = None,
     more: Mapping[str, Sequence[str]] | None = None,
-) -> AxesTable:
+) -> page.AxesTable:
     """A table of six axes, deg and m. `words` replace the values of axes that have none; `more` are further columns by
     head."""
     labels, more = labels or {}, more or {}
@@ -148,7 +137,7 @@ def axes_table(
         scale = widest[unit] or 1.0
         known = value is not None and axis not in labels
         lines.append(
-            AxisLine(
+            page.AxisLine(
                 name=AXIS_NAMES[axis],
                 value=axis_value(value, axis) if known else labels.get(axis, "not told"),
                 sigma=axis_value(sigma, axis, sign=False) if known else "",
@@ -158,31 +147,31 @@ def axes_table(
                 more=tuple(column[axis] for column in more.values()),
             )
         )
-    return AxesTable(caption, value_name, tuple(lines), tuple(more))
+    return page.AxesTable(caption, value_name, tuple(lines), tuple(more))
 
 
-def copies_of(transform: Transform, camera: str, lidar: str, *, warning: str = "") -> Copies:
+def copies_of(transform: Transform, camera: str, lidar: str, *, warning: str = "") -> page.Copies:
     """A transform in the forms that other programs take. A `warning` is the first line of each, as a comment."""
     T_lidar_camera = se3.inverse(np.array(transform.matrix))
     rows = [list(row) for row in transform.matrix]
     inverse = [[float(value) for value in row] for row in T_lidar_camera]
     x, y, z, w = transform.quaternion_xyzw
     above = f"# {warning}\n" if warning else ""
-    return Copies(
+    return page.Copies(
         (
-            Copy(
+            page.Copy(
                 "T_camera_lidar, 4 × 4",
                 f"p_camera = T · p_lidar, metres: from {lidar} to {camera}. The copy has every digit, as JSON.",
                 above + _matrix(rows),
                 above + json.dumps(rows),
             ),
-            Copy(
+            page.Copy(
                 "Translation and quaternion",
                 "The same as x y z (m) and qx qy qz qw, the order of ROS and Eigen's coefficients.",
                 above + _matrix((transform.translation_m, (x, y, z, w))),
                 above + " ".join(repr(value) for value in (*transform.translation_m, x, y, z, w)),
             ),
-            Copy(
+            page.Copy(
                 "T_lidar_camera, 4 × 4",
                 f"The inverse: from {camera} to {lidar}. As JSON.",
                 above + _matrix(inverse),
@@ -194,11 +183,11 @@ def copies_of(transform: Transform, camera: str, lidar: str, *, warning: str = "
 
 def figures_block(
     caption: str, metrics: Mapping[str, MetricReply], *, deciding: frozenset[str] | None = None
-) -> Figures:
+) -> page.Figures:
     """Every figure with its limit, its meaning and, where it fails, what to do; failing ones first. Figures that are
     not among the `deciding` ones (None: all decide) come last, in grey and without advice."""
     lines = [_figure(name, metric, deciding is None or name in deciding) for name, metric in metrics.items()]
-    return Figures(caption, tuple(sorted(lines, key=lambda line: (not line.decided, line.met is not False))))
+    return page.Figures(caption, tuple(sorted(lines, key=lambda line: (not line.decided, line.met is not False))))
 
 
 def title_of(name: str) -> str:
@@ -229,13 +218,13 @@ def _advice(code: str) -> str:
     return OTHER_ADVICE.get(code, "")
 
 
-def _figure(name: str, metric: MetricReply, decided: bool) -> FigureLine:
+def _figure(name: str, metric: MetricReply, decided: bool) -> page.FigureLine:
     known = FIGURES.get(name)
     met = None if metric.limit is None else metric.passed
     meaning = "" if known is None else known.measures
     if met is False and known is not None and decided:
         meaning = f"{meaning} Here: {known.fails}."
-    return FigureLine(
+    return page.FigureLine(
         code=name,
         title=name if known is None else known.title,
         value=significant(metric.value),
@@ -323,12 +312,12 @@ class Provenance:
             ("On", self.machine),
         )
 
-    def section(self, of: Sequence[tuple[str, str]] = ()) -> Section:
+    def section(self, of: Sequence[tuple[str, str]] = ()) -> page.Section:
         """The last section of a page: what the page is made `of` (names and values; hashes are shown as code), followed
         by these items."""
         items = (*of, *self.items())
         codes = {name for name, _ in items if "sha256" in name or "hash" in name}
-        return Section("Provenance", (Facts(items, frozenset({*codes, "Command"})),))
+        return page.Section("Provenance", (page.Facts(items, frozenset({*codes, "Command"})),))
 
 
 def depth_items(identity: str) -> tuple[tuple[str, str], ...]:

@@ -12,19 +12,9 @@ from typing import Literal
 
 import numpy as np
 
+from coec.calibration import types
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.monitor.check_verdict import MIN_PAIRS
-from coec.calibration.types import (
-    INTRINSICS_OFF,
-    MOVED,
-    CameraFrame,
-    EgoMotion,
-    EncodedImage,
-    Estimate,
-    FramePair,
-    LidarFrame,
-    Reason,
-)
 from coec.config import PairingConfig, WindowConfig
 from coec.geometry.cameras import Camera, domain_angle_rad, project_point, unproject_point
 from coec.geometry.points import lengths
@@ -144,17 +134,17 @@ def fitness_of(recording: RecordingSource) -> Fitness:
     stamps_ns = recording.camera_stamps_ns
     sampled = evenly_spread(len(stamps_ns), min(SAMPLED_FRAMES, len(stamps_ns)))
     pairer = Pairer(PairingConfig(max_stamp_jump_s=1e9), expects_motion=bool(recording.motion_stamps_ns))
-    pairs: list[FramePair] = []
-    sweeps: list[LidarFrame] = []
-    motions: list[EgoMotion] = []
-    image: CameraFrame | None = None
+    pairs: list[types.FramePair] = []
+    sweeps: list[types.LidarFrame] = []
+    motions: list[types.EgoMotion] = []
+    image: types.CameraFrame | None = None
     for message in recording.messages(sampled):
         match message:
-            case CameraFrame():
+            case types.CameraFrame():
                 image = message
-            case LidarFrame():
+            case types.LidarFrame():
                 sweeps.append(message)
-            case EgoMotion():
+            case types.EgoMotion():
                 motions.append(message)
         pairs += pairer.push(message)
     pairs += pairer.flush()
@@ -191,7 +181,8 @@ def fitness_of(recording: RecordingSource) -> Fitness:
     )
     recognised = [Notice(one.level, one.code, one.text) for one in recognitions_of(recording, sweeps)]
     recognised += [*lens_notices(rig.camera), *([] if image is None else image_notices(image.image))]
-    return _with_remarks(seen, recognised)
+    remarks = [notice for notice in (*recognised, *_remarks(seen)) if notice is not None]
+    return replace(seen, remarks=tuple(sorted(remarks, key=lambda notice: _ORDER[notice.level])))
 
 
 def pairs_of_calibration(seen: Fitness) -> int:
@@ -208,8 +199,8 @@ _GAIN: Mapping[str, float] = MappingProxyType(
         "runner_up": -0.5,
         "sigma_deg": -1.0,
         "sigma_m": -1.0,
-        INTRINSICS_OFF: -0.5,
-        MOVED: -0.5,
+        types.INTRINSICS_OFF: -0.5,
+        types.MOVED: -0.5,
     }
 )
 """The power of the number of pairs with which a figure changes at best: if every pair is independent, no error is
@@ -221,7 +212,7 @@ CLOSE = 1.1
 """A figure within this factor of its limit may be on the other side of it from another start."""
 
 
-def reasons_that_stay(trial: Estimate, pairs: int) -> tuple[Reason, ...]:
+def reasons_that_stay(trial: types.Estimate, pairs: int) -> tuple[types.Reason, ...]:
     """The reasons for which a trial was refused that would refuse a calibration of so many `pairs` of the same
     recording, too, from any start and even if each pair more were as good as any."""
     times = max(pairs / trial.pairs, 1.0)
@@ -249,7 +240,7 @@ def cadence(stamps_ns: Sequence[int]) -> Cadence:
     return Cadence(len(stamps_ns), 1.0 / median_s if median_s > 0.0 else 0.0, float(gaps_s.max()))
 
 
-def passes(sweep: LidarFrame) -> int:
+def passes(sweep: types.LidarFrame) -> int:
     """How often the times of a sweep's points run through, in the order in which the points are stored: one more than
     they begin anew; 0 without times."""
     times_s = sweep.time_offset_s
@@ -257,11 +248,6 @@ def passes(sweep: LidarFrame) -> int:
         return 0
     span_s = float(times_s.max() - times_s.min())
     return 1 + int((np.diff(times_s) < -0.5 * span_s).sum())
-
-
-def _with_remarks(seen: Fitness, recognised: Sequence[Notice]) -> Fitness:
-    remarks = [notice for notice in (*recognised, *_remarks(seen)) if notice is not None]
-    return replace(seen, remarks=tuple(sorted(remarks, key=lambda notice: _ORDER[notice.level])))
 
 
 _ORDER: dict[Level, int] = {"fail": 0, "warn": 1, "ok": 2}
@@ -305,7 +291,7 @@ def _view(seen: Fitness) -> Notice | None:
     return Notice("fail" if seen.in_view == 0.0 else "warn", "little_in_view", text)
 
 
-def image_notices(image: EncodedImage) -> list[Notice]:
+def image_notices(image: types.EncodedImage) -> list[Notice]:
     """What is doubtful about an image by itself: bytes of YUV 4:2:2 in the other order."""
     if not is_order_swapped(image):
         return []
@@ -349,7 +335,7 @@ def lens_notices(camera: Camera) -> list[Notice]:
     return notices
 
 
-def _not_finite(sweep: LidarFrame) -> float:
+def _not_finite(sweep: types.LidarFrame) -> float:
     return sweep.not_finite / (sweep.not_finite + len(sweep.xyz_m))
 
 

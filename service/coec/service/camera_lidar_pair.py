@@ -7,44 +7,23 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 
 from coec.calibration.frames.window import SliceClosed
+from coec.calibration.types import Frame
 from coec.config import CalibrationConfig, Config, PairConfig
 from coec.io.logs import LossCounter
-from coec.io.msgpack_frames import encode_camera
+from coec.io.msgpack_frames import encode
 from coec.io.rig_files import rig_of
 from coec.service.api.command_execution import Commands
 from coec.service.api.pair_answers import PairAnswers
 from coec.service.configuration import settings_hash
+from coec.service.engine import messages
 from coec.service.engine.commands import CommandExecutor, PairCommand, Surroundings
 from coec.service.engine.frame_selector import FrameSelector
-from coec.service.engine.messages import (
-    Action,
-    CommissioningSubject,
-    Evaluate,
-    Event,
-    JobDone,
-    KeepSnippet,
-    PairSchedule,
-    Prefetch,
-    Publish,
-    Reconfigured,
-    RecordBetween,
-    RecordPair,
-    SensorTime,
-    SubmitCheck,
-    SubmitCommissioning,
-    SubmitPicture,
-    SubmitSolve,
-    Tick,
-    UseCalibration,
-    WindowSubject,
-)
 from coec.service.engine.pair import Pair
 from coec.service.engine.pair_stream import PairStream
 from coec.service.engine.schedule import Request, Schedule
-from coec.service.ingest.decoder import Frame
+from coec.service.ingest.decoder import SensorStream
 from coec.service.ingest.frame_buffers import FrameRing
-from coec.service.ingest.sensor_stream import SensorStream
-from coec.service.recording.recorder import Recorder, RecordingPlan, WindowRecorded
+from coec.service.recording.recorder import RecordBetween, Recorder, RecordingPlan, RecordPair, WindowRecorded
 from coec.service.recording.snippets import SnippetRecorder
 from coec.service.records.pair_store import PairStore
 from coec.service.records.rig_store import RigBaseline
@@ -72,7 +51,7 @@ class CameraLidarPair:
         baseline = RigBaseline(pair, rig, config.state)
         context.disk_writer.register(baseline)
         member = vehicle.rig.join(pair, rig.T_camera_lidar_nominal, store.state)
-        schedule: PairSchedule = Schedule()
+        schedule: messages.PairSchedule = Schedule()
         first_slice_s = vehicle.budget.join(pair.name, pair.monitor, pair.window)
         selector = FrameSelector(
             pair,
@@ -94,7 +73,9 @@ class CameraLidarPair:
         if context.snippets is not None:
             snippets = SnippetRecorder(plan.rig, plan.metadata, context.snippets, losses, packed=plan.packed)
         self.recorder = Recorder(plan, folder, losses, context.recording, vehicle.inbox.post, snippets)
-        ring = None if snippets is None else FrameRing(config.snippets, _ring_bytes(config), snippets.submit)
+        # Half of the pair's share, because as much again is in memory while a snippet is written.
+        ring_bytes = config.snippets.memory_bytes // (2 * max(len(config.every_pair), 1))
+        ring = None if snippets is None else FrameRing(config.snippets, ring_bytes, snippets.submit)
         self.stream = PairStream(pair, config, vehicle, losses, ring)
         self.commands = Commands(pair.name, config.vehicle, store, vehicle.inbox)
         self.answers = PairAnswers(
@@ -110,7 +91,7 @@ class CameraLidarPair:
         entry for the history."""
         self.answers.reconfigure(pair)
         self.recorder.follow(self._plan(pair, pair.calibration))
-        self._context.vehicle.inbox.post(self.name, Reconfigured(pair, stale_after_s, history_text))
+        self._context.vehicle.inbox.post(self.name, messages.Reconfigured(pair, stale_after_s, history_text))
 
     def _plan(self, pair: PairConfig, calibration: CalibrationConfig) -> RecordingPlan:
         metadata = {**self._metadata, "pair": pair.name, "settings_hash": settings_hash(pair)}
@@ -133,7 +114,7 @@ class CameraLidarPair:
         del name
         return self.stream.push
 
-    def on_event(self, event: Event | PairCommand) -> object:
+    def on_event(self, event: messages.Event | PairCommand) -> object:
         """Takes an event; returns the acknowledgement of a command."""
         if isinstance(event, PairCommand):
             if event.name == "calibrate":
@@ -142,9 +123,9 @@ class CameraLidarPair:
             acknowledgement, actions = self._executor.execute(event, around)
             self._do(actions)
             return acknowledgement
-        if isinstance(event, JobDone):
+        if isinstance(event, messages.JobDone):
             self._release(event)
-        elif isinstance(event, Reconfigured):
+        elif isinstance(event, messages.Reconfigured):
             self._pair = event.pair
             self._executor.reconfigure(event.pair)
         self._step(event)
@@ -161,13 +142,13 @@ class CameraLidarPair:
         if stamp_ns is None:
             return False
         self.engine.warms_up = self._context.worker.warms_up
-        self._step(SensorTime(stamp_ns))
+        self._step(messages.SensorTime(stamp_ns))
         is_forced = not self.recorder.has_room or self.engine.waits(stamp_ns)
         if not is_forced:
             self.stream.held.stop_waiting()
         elif not self.stream.held.has_waited(now_s):
             return False
-        self._step(Evaluate(self.stream.take(), is_forced))
+        self._step(messages.Evaluate(self.stream.take(), is_forced))
         return True
 
     def tick(self, *, waiting: bool) -> None:
@@ -177,17 +158,17 @@ class CameraLidarPair:
         if end_ns is not None and self.stream.silence_ends(end_ns):
             self.stream.end_in_silence(end_ns, self.engine.selector.statistics.last_ns)
             if not self.stream.held:
-                self._step(SensorTime(end_ns))
+                self._step(messages.SensorTime(end_ns))
 
     def _tick(self) -> None:
-        self._step(Tick(self._context.worker.compiled_s, self.stream.report))
+        self._step(messages.Tick(self._context.worker.compiled_s, self.stream.report))
 
     def finish_pairs(self) -> None:
         """Evaluates every frame pair that has come, even if it should wait for a result."""
         self.stream.flush()
         while (stamp_ns := self.stream.next_ns) is not None:
-            self._step(SensorTime(stamp_ns))
-            self._step(Evaluate(self.stream.take(), is_forced=True))
+            self._step(messages.SensorTime(stamp_ns))
+            self._step(messages.Evaluate(self.stream.take(), is_forced=True))
 
     def finish_window(self) -> None:
         """Ends the open window when the service ends; called after the thread of the engine has ended."""
@@ -196,72 +177,67 @@ class CameraLidarPair:
         closed = self.engine.selector.finish()
         self._do([] if closed is None else [closed])
 
-    def _step(self, event: Event) -> None:
+    def _step(self, event: messages.Event) -> None:
         self._do(self.engine.step(event))
 
     # --- actions ----------------------------------------------------------------------------------------------------
 
-    def _do(self, actions: Iterable[Action]) -> None:
+    def _do(self, actions: Iterable[messages.Action]) -> None:
         for action in actions:
             match action:
-                case RecordPair():
-                    self.recorder.add(action.window_id, action.pair, action.T_camera_lidar)
-                case RecordBetween():
-                    self.recorder.add_between(action.window_id, action.pair)
+                case RecordPair() | RecordBetween():
+                    self.recorder.add(action)
                 case SliceClosed():
                     self.recorder.end(action)
-                case UseCalibration():
+                case messages.UseCalibration():
                     self.recorder.reconfigure(action.calibration)
-                case KeepSnippet():
+                case messages.KeepSnippet():
                     self.stream.keep_snippet(action.event, action.T_camera_lidar)
-                case Publish():
+                case messages.Publish():
                     self.answers.on_update(action.snapshot)
-                case Prefetch():
-                    self._context.worker.prefetch(self.name, encode_camera(action.camera))
+                case messages.Prefetch():
+                    self._context.worker.prefetch(self.name, encode(action.camera))
                 case _:
                     self._context.worker.submit(self._job(action))
-                    if isinstance(action, SubmitCheck):
+                    if isinstance(action, messages.SubmitCheck):
                         self._context.show(self._pair, action.pairs[-1], action.served.T_camera_lidar)
 
-    def _job(self, action: SubmitCheck | SubmitSolve | SubmitPicture | SubmitCommissioning) -> worker_jobs.WorkerJob:
+    def _job(
+        self,
+        action: messages.SubmitCheck | messages.SubmitSolve | messages.SubmitPicture | messages.SubmitCommissioning,
+    ) -> worker_jobs.WorkerJob:
         """The job of an action, whose outcome comes back as `JobDone` with the same subject. Windows stay on the disk
         until it has ended."""
-        subject = action.request if isinstance(action, SubmitCheck) else action.subject
+        subject = action.request if isinstance(action, messages.SubmitCheck) else action.subject
         done = partial(self._context.vehicle.post_outcome, self.name, subject)
         folder = self._context.folder
         match action:
-            case SubmitCheck():
+            case messages.SubmitCheck():
                 return worker_jobs.check(
                     self.name, action.calibration, action.served.T_camera_lidar, action.pairs, done
                 )
-            case SubmitSolve():
+            case messages.SubmitSolve():
                 folder.hold(action.subject.window_id)
                 return worker_jobs.solve(self.name, action.path, action.subject.window_id, done, action.subject.live)
-            case SubmitCommissioning():
+            case messages.SubmitCommissioning():
                 for window_id in action.subject.window_ids:
                     folder.hold(window_id)
                 paths = [folder.path(window_id) for window_id in action.subject.window_ids]
                 return worker_jobs.commission(self.name, action.calibration, action.pose, paths, done)
-            case SubmitPicture():
+            case messages.SubmitPicture():
                 path = folder.path(action.window_id)
                 if len(action.poses) == 1:
                     return worker_jobs.overlay(self.name, path, action.poses[0], action.captions[0], done)
                 (first, second), (one, other) = action.poses, action.captions
                 return worker_jobs.comparison(self.name, path, (first, second), (one, other), done)
 
-    def _release(self, event: JobDone) -> None:
+    def _release(self, event: messages.JobDone) -> None:
         """A job has ended: gives back what was reserved for it."""
         match event.subject:
-            case WindowSubject():
+            case messages.WindowSubject():
                 self._context.folder.release(event.subject.window_id)
-            case CommissioningSubject():
+            case messages.CommissioningSubject():
                 for window_id in event.subject.window_ids:
                     self._context.folder.release(window_id)
             case Request():
                 self._context.vehicle.budget.release(self.name)
-
-
-def _ring_bytes(config: Config) -> int:
-    """Size of one pair's ring: half of the pair's share, because as much again is in memory while a snippet is
-    written."""
-    return config.snippets.memory_bytes // (2 * max(len(config.every_pair), 1))

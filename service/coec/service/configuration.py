@@ -14,8 +14,7 @@ from typing import Any
 from coec.config import Config, OpenPairConfig, PairConfig, config_hash
 from coec.errors import require_readable
 from coec.io.rig_files import check_given, rig_of
-from coec.io.zenoh.endpoints import redacted
-from coec.io.zenoh.session import check_certificates, settings_of, settings_source
+from coec.io.zenoh.session import check_certificates, redacted, settings_of, settings_source
 
 RELOADED: Mapping[str, str] = {
     "log.*": "at once in the service; in the worker after a restart",

@@ -3,9 +3,6 @@ says what is still missing; and stores discovered calibrations in the state dire
 same ones, whatever is published by then. What the configuration gives is used as it is; only what it leaves out is
 looked for. Nothing is assumed: the pair stays pending if `/tf_static` does not connect two frames, or an image has
 another size than its `CameraInfo`.
-
-What the configuration gives is used as it is; only what it leaves out is looked for. Nothing is assumed: the pair waits
-if `/tf_static` does not connect two frames, or an image has another size than its `CameraInfo`.
 """
 
 import json

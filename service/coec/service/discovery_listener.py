@@ -43,9 +43,6 @@ second."""
 IDLE_S = 0.25
 """Time between two turns, s."""
 
-TOO_LARGE_CAUSE = "message_too_large"
-"""Cause of a loss: an image above `limits.max_message_bytes`."""
-
 INFO = "info"
 """Place of a loss: a `CameraInfo`. The streams `camera` and so on are places, too."""
 
@@ -91,6 +88,11 @@ class _PendingPair:
     refused: Reason | None = None
     news: bool = True
     lost: Counter[str] = field(default_factory=Counter)
+
+    def count_loss(self, place: str, cause: str) -> None:
+        self.news = True
+        self.lost[f"{place}_{cause}"] += 1
+        _log_loss(place, cause, self.lost[f"{place}_{cause}"])
 
 
 class DiscoveryListener:
@@ -230,13 +232,11 @@ class DiscoveryListener:
         take = self._take_info if stream == INFO else self._take_frame
         cause = _attempt(lambda: take(each, stream, sample))
         refused = each.received.refused
-        each.news |= cause is not None or stream in refused
         if cause is None:
-            refused.pop(stream, None)
+            each.news |= refused.pop(stream, None) is not None
             return
         refused[stream] = cause
-        each.lost[f"{stream}_{cause}"] += 1
-        _log_loss(stream, cause, each.lost[f"{stream}_{cause}"])
+        each.count_loss(stream, cause)
 
     def _take_info(self, each: _PendingPair, stream: str, sample: InputSample) -> None:
         del stream
@@ -244,17 +244,13 @@ class DiscoveryListener:
         known = each.received.info
         if info.k[0] == 0.0 and known is not None and known.k[0] != 0.0:
             # A driver that starts, or a second camera that is not calibrated, takes nothing away.
-            each.lost[f"{INFO}_uncalibrated"] += 1
-            each.news = True
-            _log_loss(INFO, "uncalibrated", each.lost[f"{INFO}_uncalibrated"])
+            each.count_loss(INFO, "uncalibrated")
             return
         each.news |= info != known
         each.received.info = info
         if each.received.dropped_bytes(each.pair):
             # Zenoh drops such images, and tells nobody: each CameraInfo stands for one.
-            each.lost[f"{CAMERA}_{TOO_LARGE_CAUSE}"] += 1
-            each.news = True
-            _log_loss(CAMERA, TOO_LARGE_CAUSE, each.lost[f"{CAMERA}_{TOO_LARGE_CAUSE}"])
+            each.count_loss(CAMERA, "message_too_large")  # an image above `limits.max_message_bytes`
 
     def _take_frame(self, each: _PendingPair, stream: str, sample: InputSample) -> None:
         received = each.received

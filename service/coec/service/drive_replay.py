@@ -1,5 +1,9 @@
 """Replays a recorded drive through the engine of the service: which checks and windows it makes of it, what it serves,
-and when.
+and when; what it decided in the order of sensor time, how two such logs differ, and both for people to read.
+
+A log is made of the records of a pair: every check, every window's estimate, every extrinsic that was served, every
+state of health. It has one JSON object a line. States that the steady clock alone brings about, such as a check that is
+overdue, have no sensor time and depend on the machine; a log leaves them out, and the return from them.
 
 The engine is that of the service; no thread runs it. The sensor time of the frames is the clock, so no frame is dropped
 and no time passes while a job runs. A result is handed to the engine when the drive has come to the sensor time from
@@ -8,54 +12,208 @@ which it counts, so two replays are equal to the byte whatever the machine does.
 
 from __future__ import annotations
 
+import json
 import queue
 import re
+import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from tempfile import TemporaryDirectory
+from typing import Any, cast
 
 from coec.calibration.frames.window import SliceClosed
-from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
+from coec.calibration.types import Frame
 from coec.config import BudgetConfig, Config, PairConfig
-from coec.errors import SourceError
+from coec.errors import SourceError, UsageError
 from coec.io.disk_writer import DiskWriter
-from coec.io.msgpack_frames import encode_camera, encode_ego, encode_lidar
+from coec.io.msgpack_frames import encode
 from coec.io.zenoh.bus import MSGPACK, InputSample
+from coec.io.zenoh.player import stream_of
 from coec.io.zenoh.ros_node import RosTopicList
 from coec.reports.formatting import count
+from coec.reports.page import Facts, Page, Section, Table, Text, write
 from coec.schemas.keys import Keys
 from coec.service.camera_lidar_pair import CameraLidarPair
 from coec.service.cpu_budget import Budget
-from coec.service.decision_log import MOST_CHECKS, MOST_ENTRIES, Decision, decisions_of
-from coec.service.engine.messages import (
-    Action,
-    Evaluate,
-    Event,
-    JobDone,
-    JobSubject,
-    PairRequest,
-    RecordBetween,
-    RecordPair,
-    SensorTime,
-    SubmitCheck,
-    Tick,
-    WindowSubject,
-)
+from coec.service.engine import messages
 from coec.service.engine.rig import RigEstimator
 from coec.service.engine.vehicle import Vehicle
-from coec.service.ingest.decoder import CAMERA, EGO, LIDAR
 from coec.service.process_lifetime import joined
-from coec.service.recording.recorder import RecordingThread
+from coec.service.recording.recorder import RecordBetween, RecordingThread, RecordPair
 from coec.service.recording.window_store import WindowStore
+from coec.service.records.history import CheckLog, PairHistory
 from coec.service.records.pair_store import PairRecords
 from coec.service.records.state_store import StateStore
 from coec.service.timing import NS_PER_S, Clock
 from coec.service.vehicle_context import VehicleContext
 from coec.service.worker.supervisor import Worker, WorkerState
 from coec.service.worker.worker_jobs import JobOutcome, Kind, WorkerJob
+
+KINDS = ("check", "estimate", "extrinsic", "state")
+"""Of decisions, in the order in which those of one stamp are listed."""
+
+MOST_ENTRIES, MOST_CHECKS = 10_000, 100_000
+"""Entries of the history, and checks, of a log: as many as a service can keep."""
+
+MOST_BYTES = 2**28
+"""Largest log that is read."""
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """One decision.
+
+    Attributes:
+        kind: one of `KINDS`.
+        stamp_ns: sensor time of the data behind it.
+        name: what it is about: id of the window, outcome of the checks, provenance of the extrinsic, state.
+        values: everything that is compared.
+    """
+
+    kind: str
+    stamp_ns: int
+    name: str
+    values: dict[str, Any]
+
+    def line(self) -> str:
+        """As a line of a log."""
+        document = {"kind": self.kind, "stamp_ns": self.stamp_ns, "name": self.name, "values": self.values}
+        return json.dumps(document, sort_keys=True, separators=(",", ":"))
+
+
+def decisions_of(records: PairRecords) -> tuple[Decision, ...]:
+    """The decisions in the records of a pair."""
+    return tuple(sorted(_decisions(records), key=lambda one: (one.stamp_ns, KINDS.index(one.kind))))
+
+
+def _decisions(records: PairRecords) -> Iterator[Decision]:
+    for check in records.checks:
+        values = check.model_dump(mode="json", exclude={"state"})
+        yield Decision("check", check.stamp_ns, check.outcome, values)
+    state = ""
+    for record in records.entries:
+        entry = record.entry
+        if entry.stamp_ns is None or (entry.kind == "state" and entry.code == state):
+            continue
+        state = entry.code if entry.kind == "state" else state
+        if record.result is not None:
+            yield Decision("estimate", entry.stamp_ns, entry.code, record.result.model_dump(mode="json"))
+        elif entry.kind in ("extrinsic", "state"):
+            pose = None if entry.camera_from_lidar is None else entry.camera_from_lidar.model_dump(mode="json")
+            values = {"code": entry.code, "window_id": entry.window_id, "camera_from_lidar": pose}
+            yield Decision(entry.kind, entry.stamp_ns, entry.code, values)
+
+
+def read_log(path: Path, pair: str) -> tuple[Decision, ...]:
+    """The decisions in a log, or in the state directory of a service.
+
+    Raises:
+        SourceError: there is no such file, or it is neither.
+    """
+    if path.is_dir():
+        return _of_state_directory(path, pair)
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise SourceError(f"{path} is larger than {MOST_BYTES / 1e6:.0f} MB: it is no log of decisions")
+        documents = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        return tuple(
+            Decision(str(one["kind"]), int(one["stamp_ns"]), str(one["name"]), dict(one["values"])) for one in documents
+        )
+    except OSError as error:
+        raise SourceError(f"{path} cannot be read: {error.strerror}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise SourceError(f"{path} is no log of decisions: write one with `coec replay DRIVE --log FILE`") from error
+
+
+def _of_state_directory(folder: Path, pair: str) -> tuple[Decision, ...]:
+    """Reads copies of the files, because damaged ones are set aside when they are opened."""
+    with TemporaryDirectory() as copies:
+        try:
+            for file in folder.glob(f"*-{pair}.jsonl"):
+                if file.stat().st_size > MOST_BYTES:
+                    raise SourceError(f"{file} is larger than {MOST_BYTES / 1e6:.0f} MB")
+                shutil.copyfile(file, Path(copies) / file.name)
+        except OSError as error:
+            raise SourceError(f"{folder} cannot be read: {error.strerror}") from error
+        history = PairHistory(Path(copies), pair, MOST_ENTRIES, {})
+        checks = CheckLog(Path(copies) / f"checks-{pair}.jsonl", MOST_CHECKS)
+        decisions = decisions_of(PairRecords(history.entries(), checks.checks(), ()))
+    if not decisions:
+        others = sorted(file.stem.removeprefix("checks-") for file in folder.glob("checks-*.jsonl"))
+        hint = f"; it has those of {', '.join(others)}: give the service's --config" if others else ""
+        raise SourceError(f"{folder} holds no records of a pair {pair}{hint}")
+    return decisions
+
+
+def write_log(path: Path, decisions: Iterable[Decision]) -> None:
+    """Writes a log.
+
+    Raises:
+        UsageError: the file cannot be written.
+    """
+    try:
+        path.write_text("".join(f"{one.line()}\n" for one in decisions), encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{path} cannot be written: {error.strerror}") from error
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """A decision that differs. `before`, `after`: None if there is none of this kind at this sensor time. `fields`:
+    places of the values that differ."""
+
+    before: Decision | None
+    after: Decision | None
+    fields: tuple[str, ...] = ()
+
+    @property
+    def either(self) -> Decision:
+        """The decision, of whichever log has it."""
+        decision = self.after or self.before
+        assert decision is not None
+        return decision
+
+
+def differences(before: Sequence[Decision], after: Sequence[Decision]) -> tuple[Difference, ...]:
+    """What differs between two logs, in the order of sensor time. Decisions of one kind and stamp belong together."""
+    keyed_before, keyed_after = _keyed(before), _keyed(after)
+    result = []
+    for key in sorted(keyed_before.keys() | keyed_after.keys()):
+        one, other = keyed_before.get(key), keyed_after.get(key)
+        if one is None or other is None:
+            result.append(Difference(one, other))
+        elif one.values != other.values:
+            places = (place.partition("[")[0] for place, _, _ in value_differences(one.values, other.values))
+            result.append(Difference(one, other, tuple(dict.fromkeys(places))))
+    return tuple(result)
+
+
+def _keyed(decisions: Sequence[Decision]) -> dict[tuple[int, int, int], Decision]:
+    """By stamp, kind, and number among those of one stamp and kind."""
+    keyed: dict[tuple[int, int, int], Decision] = {}
+    for decision in decisions:
+        kind = KINDS.index(decision.kind) if decision.kind in KINDS else len(KINDS)
+        number = 0
+        while (decision.stamp_ns, kind, number) in keyed:
+            number += 1
+        keyed[decision.stamp_ns, kind, number] = decision
+    return keyed
+
+
+def value_differences(before: Any, after: Any, at: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """(place, before, after) of every value that differs between two documents."""
+    if isinstance(before, dict) and isinstance(after, dict):
+        for key in sorted(before.keys() | after.keys()):
+            yield from value_differences(before.get(key), after.get(key), f"{at}.{key}" if at else str(key))
+    elif isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
+        for index, (one, other) in enumerate(zip(before, after, strict=True)):
+            yield from value_differences(one, other, f"{at}[{index}]")
+    elif before != after:
+        yield at, before, after
+
 
 POLL_S = 0.02
 """Longest wait for a worker or the disk before events are looked for again, s."""
@@ -70,8 +228,6 @@ STOP_S = 5.0
 
 MOST_CORES = 64.0
 """Budget of a replay: what work costs does not decide what is checked."""
-
-Frame = CameraFrame | LidarFrame | EgoMotion
 
 
 class DriveClock(Clock):
@@ -137,14 +293,14 @@ class _ReplayVehicle(Vehicle):
 
     def __init__(self, config: Config, rig: RigEstimator, clock: DriveClock) -> None:
         super().__init__(config.limits, Budget(config.budget, clock.monotonic_s), rig, lambda _: None, clock=clock)
-        self._outcomes: queue.SimpleQueue[tuple[str, JobSubject, JobOutcome]] = queue.SimpleQueue()
-        self._arrived: list[tuple[str, JobSubject, JobOutcome]] = []
+        self._outcomes: queue.SimpleQueue[tuple[str, messages.JobSubject, JobOutcome]] = queue.SimpleQueue()
+        self._arrived: list[tuple[str, messages.JobSubject, JobOutcome]] = []
 
-    def post_outcome(self, receiver: str, subject: JobSubject, outcome: JobOutcome) -> None:
+    def post_outcome(self, receiver: str, subject: messages.JobSubject, outcome: JobOutcome) -> None:
         """Called on the thread of a worker."""
         self._outcomes.put((receiver, subject, outcome))
 
-    def deliver(self, requested: JobSubject) -> None:
+    def deliver(self, requested: messages.JobSubject) -> None:
         """Posts the outcome about `requested` if it has come; waits up to `POLL_S` for any."""
         with suppress(queue.Empty):
             if not any(subject == requested for _, subject, _ in self._arrived):
@@ -209,11 +365,15 @@ class _ReplayedPair(CameraLidarPair):
         self.transitions: list[Transition] = []
         super().__init__(pair, config, context)
 
-    def _step(self, event: Event) -> None:
+    def _step(self, event: messages.Event) -> None:
         before = self.engine.store.state.health.value
         actions = self.engine.step(event)
         health = (before, self.engine.store.state.health.value)
-        idle = not actions if isinstance(event, SensorTime | Evaluate) else isinstance(event, Tick)
+        idle = (
+            not actions
+            if isinstance(event, messages.SensorTime | messages.Evaluate)
+            else isinstance(event, messages.Tick)
+        )
         if not idle or health[0] != health[1]:
             stamp_ns = self._context.vehicle.clock.wall_ns()
             self.transitions.append(Transition(stamp_ns, _event_text(event), tuple(_action_texts(actions)), health))
@@ -223,7 +383,7 @@ class _ReplayedPair(CameraLidarPair):
         """Sensor time has come to the end of the open slice."""
         end_ns = self.engine.selector.slice_end_ns
         if end_ns is not None:
-            self._step(SensorTime(end_ns))
+            self._step(messages.SensorTime(end_ns))
 
 
 class DriveReplay:
@@ -272,10 +432,9 @@ class DriveReplay:
             started_s = time.monotonic()
             for frame in frames:
                 self._clock.stamp_ns = max(self._clock.stamp_ns, frame.stamp_ns)
-                stream, payload = _packed(frame)
-                sensor = self._pair.sensors.get(stream)
+                sensor = self._pair.sensors.get(stream_of(frame))
                 if sensor is not None:
-                    self._vehicle.inbox.put(sensor.number, InputSample(payload, MSGPACK))
+                    self._vehicle.inbox.put(sensor.number, InputSample(encode(frame), MSGPACK))
                 self._settle()
                 on_frame(frame.stamp_ns)
             end_ns, health = self._clock.stamp_ns, self._pair.engine.store.state.health.value
@@ -330,28 +489,17 @@ class DriveReplay:
                 self._deliver_oldest(pair.engine.oldest_request)
             self._settle()
 
-    def _deliver_oldest(self, request: PairRequest) -> None:
-        self._vehicle.deliver(request.subject if isinstance(request.subject, WindowSubject) else request)
+    def _deliver_oldest(self, request: messages.PairRequest) -> None:
+        self._vehicle.deliver(request.subject if isinstance(request.subject, messages.WindowSubject) else request)
 
 
-def _packed(frame: Frame) -> tuple[str, bytes]:
-    """The stream of a frame, and its native encoding."""
-    match frame:
-        case CameraFrame():
-            return CAMERA, encode_camera(frame)
-        case LidarFrame():
-            return LIDAR, encode_lidar(frame)
-        case EgoMotion():
-            return EGO, encode_ego(frame)
-
-
-def _event_text(event: Event) -> str:
+def _event_text(event: messages.Event) -> str:
     match event:
-        case Evaluate():
+        case messages.Evaluate():
             return "frame pair"
-        case JobDone(subject=WindowSubject() as subject):
+        case messages.JobDone(subject=messages.WindowSubject() as subject):
             return f"window {subject.window_id} solved: {event.outcome.fate.value}"
-        case JobDone():
+        case messages.JobDone():
             return f"job ended: {event.outcome.fate.value}"
         case _:
             return _type_label(event)
@@ -362,14 +510,105 @@ def _type_label(value: object) -> str:
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(value).__name__).lower()
 
 
-def _action_texts(actions: Sequence[Action]) -> Iterator[str]:
+def _action_texts(actions: Sequence[messages.Action]) -> Iterator[str]:
     for action in actions:
         match action:
             case RecordPair() | RecordBetween():
                 yield f"{_type_label(action)} for {action.window_id}"
             case SliceClosed():
                 yield f"end of {action.window_id} with {count(action.pairs, 'pair')}"
-            case SubmitCheck():
+            case messages.SubmitCheck():
                 yield f"check of {count(len(action.pairs), 'pair')}, counts from {action.request.due_ns} ns"
             case _:
                 yield _type_label(action)
+
+
+@dataclass(frozen=True, slots=True)
+class OutlineLine:
+    """A decision as a line; `time` is in seconds of the drive."""
+
+    time: str
+    kind: str
+    name: str
+    text: str
+
+
+def outline(decisions: Sequence[Decision], first_ns: int) -> Iterator[OutlineLine]:
+    """The decisions of a drive that begins at `first_ns`; checks that say what the one before them said are counted."""
+    before, repeated = "", 0
+    for decision in decisions:
+        if decision.kind == "check" and decision.name == before:
+            repeated += 1
+            continue
+        if repeated:
+            yield OutlineLine("", "check", before, f"{count(repeated, 'more check')}")
+            repeated = 0
+        before = decision.name if decision.kind == "check" else before
+        seconds = f"{(decision.stamp_ns - first_ns) / NS_PER_S:.1f}"
+        yield OutlineLine(seconds, decision.kind, decision.name, _text(decision))
+    if repeated:
+        yield OutlineLine("", "check", before, f"{count(repeated, 'more check')}")
+
+
+def _text(decision: Decision) -> str:
+    values = decision.values
+    match decision.kind:
+        case "check":
+            return f"evidence {values['evidence']:.1f}, {'flagged' if values['flagged'] else 'not flagged'}"
+        case "estimate":
+            sigma = [value for value in values["sigma"][:3] if value is not None]
+            reasons = " ".join(reason["text"] for reason in values["verdict"]["reasons"])
+            text = f"{values['window_id']}, {values['pairs']} pairs"
+            return f"{text}, σ {max(sigma):.2f}°. {reasons}" if sigma else f"{text}. {reasons}"
+        case "extrinsic":
+            return "" if values["window_id"] is None else f"by {values['window_id']}"
+        case _:
+            return ""
+
+
+def write_replay_page(
+    path: Path, name: str, replayed: ReplayedDrive, first_ns: int, differing: Sequence[Difference] | None
+) -> None:
+    """Writes a page with the decisions of a drive and, if they were compared, what differs.
+
+    Raises:
+        RecordingError: the file cannot be written.
+    """
+    rows = [(line.time, line.kind, line.name, line.text) for line in outline(replayed.decisions, first_ns)]
+    sections = [
+        Section("Decisions", (Table("In the order of sensor time.", HEADS, rows, frozenset({0}), frozenset({3})),))
+    ]
+    if differing is not None:
+        sections.insert(0, Section("Differences", (_differences(differing, first_ns),)))
+    losses = tuple((f"{place}, {cause}", str(number)) for (place, cause), number in sorted(replayed.losses.items()))
+    if losses:
+        sections.append(Section("Losses", (Facts(losses),)))
+    facts = Facts(
+        (
+            ("Length of the drive", f"{replayed.driven_s:.0f} s"),
+            ("Health at the end", replayed.health),
+            ("Checks", str(sum(one.kind == "check" for one in replayed.decisions))),
+            ("Windows", str(sum(one.kind == "estimate" for one in replayed.decisions))),
+        )
+    )
+    write(path, Page("Replay of a drive", name, (facts,), tuple(sections)))
+
+
+HEADS = ("Time, s", "Decision", "Outcome", "Details")
+
+
+def _differences(differing: Sequence[Difference], first_ns: int) -> Table | Text:
+    if not differing:
+        return Text(("The decisions are equal.",))
+    rows = [
+        (
+            f"{(one.either.stamp_ns - first_ns) / NS_PER_S:.1f}",
+            one.either.kind,
+            "none" if one.before is None else one.before.name,
+            "none" if one.after is None else one.after.name,
+            ", ".join(one.fields),
+        )
+        for one in differing
+    ]
+    heads = ("Time, s", "Decision", "There", "Here", "Values that differ")
+    return Table("Decisions that differ.", heads, rows, frozenset({0}), frozenset({4}))

@@ -18,18 +18,6 @@ from coec.service.records.state_store import StateStore
 from coec.service.worker.supervisor import Worker
 
 
-def configured_nominal(pair: str) -> NominalStatus:
-    """Default of `Outside.nominal`: the pair's configuration gives its nominal calibration."""
-    del pair
-    return NominalStatus()
-
-
-def no_rig_problems(pair: str) -> tuple[Reason, ...]:
-    """Default of `Outside.rig_troubles`: the pair contradicts no other."""
-    del pair
-    return ()
-
-
 @dataclass(frozen=True, slots=True)
 class VehicleContext:
     """Everything that a pair shares with the others. The callables may be called from any thread.
@@ -38,7 +26,7 @@ class VehicleContext:
         vehicle: the engine, which all pairs join.
         show: `show(pair, drawn, pose)` reports a pair of frames that is being checked at an extrinsic (4, 4).
         topics: the topics that the vehicle's ROS publishes now.
-        nominal: where the nominal calibration of a pair, given by name, comes from.
+        nominal: where the nominal calibration of a pair, given by name, comes from; by default its configuration.
         rig_troubles: in what a pair, given by name, contradicts the vehicle's other pairs.
         snippets: store for the seconds around an event; None: they are not kept.
     """
@@ -54,6 +42,6 @@ class VehicleContext:
     vehicle_problems: Callable[[], tuple[Reason, ...]]
     show: Callable[[PairConfig, FramePair, Matrix4], None]
     topics: Callable[[], RosTopicList]
-    nominal: Callable[[str], NominalStatus] = configured_nominal
-    rig_problems: Callable[[str], tuple[Reason, ...]] = no_rig_problems
+    nominal: Callable[[str], NominalStatus] = lambda _: NominalStatus()
+    rig_problems: Callable[[str], tuple[Reason, ...]] = lambda _: ()
     snippets: SnippetStore | None = None

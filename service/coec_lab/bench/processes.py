@@ -25,8 +25,7 @@ from coec.config import (
     StateConfig,
 )
 from coec.errors import CalibrationError
-from coec.io.mcap.window_reader import read_window
-from coec.io.mcap.window_writer import WindowWriter
+from coec.io.mcap.windows import WindowWriter, read_window
 from coec.io.rig_files import intrinsics_config
 from coec.service.ingest.frame_buffers import frame_bytes
 from coec.service.worker import worker_jobs

@@ -9,15 +9,15 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coec.calibration.types import CameraFrame
+from coec.calibration.types import CameraFrame, Frame
 from coec.errors import OutputError, UsageError
 from coec.geometry.cameras import intrinsics_of, name_of
 from coec.geometry.se3 import inverse
-from coec.io.mcap.bag_writer import write_bag, write_messages
+from coec.io.mcap.writer import write_bag, write_messages
 from coec.io.rig_files import mask_to_png
 from coec.io.ros import message_encoding, messages
 from coec.io.ros.message_encoding import PlacedFrame
-from coec.io.ros.topics import Frame, SensorTopics, TopicMessage, image_topic, points_topic
+from coec.io.ros.topics import SensorTopics, TopicMessage, image_topic, points_topic
 from coec.io.user_files import require_absent, write_output
 from coec.reports import console
 from coec.reports.formatting import count

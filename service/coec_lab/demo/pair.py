@@ -28,8 +28,7 @@ from coec.config import Config
 from coec.geometry import compilation_events
 from coec.io import user_files as files
 from coec.io.rig_files import mask_to_png
-from coec.io.zenoh.query_client import connected
-from coec.io.zenoh.window_fetch import fetch_window
+from coec.io.zenoh.query_client import connected, fetch_window
 from coec.reports import console
 from coec.reports.commented_yaml import commented_yaml
 from coec.reports.console import COMPILING, COMPILING_S, CompilationProgress

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import zenoh
 
-from coec.calibration.types import Rig
+from coec.calibration.types import Frame, Rig
 from coec.config import (
     BudgetConfig,
     CameraConfig,
@@ -28,7 +28,7 @@ from coec.config import (
     ZenohConfig,
 )
 from coec.io.rig_files import intrinsics_config, matrix_rows
-from coec.io.zenoh.player import CAMERA, Frame, Played, Player, StreamKeys
+from coec.io.zenoh.player import CAMERA, Played, Player, StreamKeys
 from coec.schemas import replies
 from coec_lab.demo.service import MIN_FREE_BYTES, STORY_CORES
 from coec_lab.simulation.source import require_embree

@@ -18,13 +18,13 @@ from coec.config import LimitsConfig
 from coec.geometry import cameras
 from coec.io.exported_extrinsic import REFUSED
 from coec.io.images import decode_bgr
-from coec.io.mcap.window_reader import read_result, read_window
+from coec.io.mcap.windows import read_result, read_window
 from coec.io.recordings import window_cutting
 from coec.io.user_files import write_output as write_file
 from coec.reports import console, page, pictures
 from coec.reports.charts import Chart, Ground, Limit, Mark, Series
+from coec.reports.drawing import render_points as draw_overlay
 from coec.reports.formatting import count
-from coec.reports.overlay import render_points as draw_overlay
 from coec.reports.page import Block, Cell, Charts, Compare, Facts, Page, Pictures, Section, Table, Text, VerdictBanner
 from coec.reports.page_parts import TONES, Provenance, copies_of, figures_block, file_picture
 from coec.schemas import replies

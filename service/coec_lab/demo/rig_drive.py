@@ -11,7 +11,7 @@ from functools import cached_property
 from itertools import islice
 from math import hypot
 
-from coec.io.recordings.recording_source import SensorMessage
+from coec.calibration.types import Frame
 from coec.io.zenoh.player import Player
 from coec.schemas.replies import CheckReply
 from coec.schemas.rig_state import RigReply, SensorReply
@@ -105,9 +105,9 @@ SCENARIO = Scenario()
 class InstantFrames:
     """Frames of one instant: a sweep, a picture by camera, and the motion around them."""
 
-    sweep: SensorMessage
-    pictures: Mapping[str, SensorMessage]
-    motions: tuple[SensorMessage, ...]
+    sweep: Frame
+    pictures: Mapping[str, Frame]
+    motions: tuple[Frame, ...]
 
     @property
     def second(self) -> float:
@@ -124,7 +124,7 @@ class RigVehicle:
         self.scenario = scenario
         self.as_built = RigDrive(scenario.drive_config(None))
         self._drawers = drawers
-        self._started: dict[tuple[int, Arrival], Future[SensorMessage]] = {}
+        self._started: dict[tuple[int, Arrival], Future[Frame]] = {}
 
     @cached_property
     def plan(self) -> list[Instant]:
@@ -140,8 +140,8 @@ class RigVehicle:
         return self._in_order(waiting, started)
 
     def _in_order(
-        self, waiting: deque[tuple[Instant, Sequence[Future[SensorMessage]]]],
-        started: Iterator[tuple[Instant, Sequence[Future[SensorMessage]]]],
+        self, waiting: deque[tuple[Instant, Sequence[Future[Frame]]]],
+        started: Iterator[tuple[Instant, Sequence[Future[Frame]]]],
     ) -> Iterator[InstantFrames]:  # fmt: skip
         while waiting:
             instant, frames = waiting.popleft()
@@ -154,11 +154,11 @@ class RigVehicle:
         """Render the first instant in this process. What this compiles, once per machine, is reported to the waiting
         user, and every renderer has it compiled."""
         for entry in (self.plan[0].sweep, *self.plan[0].pictures.values()):
-            rendered: Future[SensorMessage] = Future()
+            rendered: Future[Frame] = Future()
             rendered.set_result(self.as_built.message(entry))
             self._started[AS_BUILT, entry] = rendered
 
-    def _begin(self, act: Act, instant: Instant) -> Sequence[Future[SensorMessage]]:
+    def _begin(self, act: Act, instant: Instant) -> Sequence[Future[Frame]]:
         """Begin to render the sweep and the pictures of an instant, unless an earlier act has."""
         entries = (instant.sweep, *instant.pictures.values())
         numbered = [(self._drive_of(act, entry), entry) for entry in entries]

@@ -59,7 +59,7 @@ from coec.geometry.points import random_direction
 from coec.geometry.se3 import inverse
 from coec.io.depth.depth_maps import open_depth
 from coec.io.images import CachedGreys, GreyImages
-from coec.reports.difference_regions import evenly
+from coec.reports.close_ups import evenly
 from coec_lab.experiments.check_drives import CHECK_PAIRS, vector6_of
 from coec_lab.experiments.rig_evidence import SLICE_S, WINDOW
 from coec_lab.experiments.simulation_schemas import Mounts, RigDriveRow, RigLook, RigWindow

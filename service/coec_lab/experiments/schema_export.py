@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from coec.schemas import commands, documents, fleet, frames, heartbeat, replies, rig_state
+from coec.schemas import commands, documents, frames, heartbeat, replies, rig_state
 from coec.schemas.message import Message
 from coec_lab.experiments import evaluation_schema, resampled_statistics, simulation_schemas
 
@@ -47,10 +47,10 @@ MESSAGES: tuple[type[Message], ...] = (
     simulation_schemas.RigDriveRow,
     simulation_schemas.RigDrivesReport,
     documents.DoctorReport,
-    fleet.WindowRow,
-    fleet.BatchReport,
-    fleet.FleetReport,
-    fleet.FleetNow,
+    documents.WindowRow,
+    documents.BatchReport,
+    documents.FleetReport,
+    documents.FleetNow,
     documents.IncidentReport,
 )
 

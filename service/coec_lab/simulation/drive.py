@@ -17,11 +17,11 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from coec.calibration.types import Matrix4, Rig
+from coec.calibration.types import Frame, Matrix4, Rig
 from coec.errors import UsageError
 from coec.geometry.cameras import Camera, build, intrinsics_of, name_of
 from coec.geometry.se3 import inverse, perturb
-from coec.io.recordings.recording_source import MOTION_REACH_NS, SensorMessage, selected_indices
+from coec.io.recordings.recording_source import MOTION_REACH_NS, selected_indices
 from coec_lab.simulation import simulated_sensors
 from coec_lab.simulation.faults import Fault, shifted
 from coec_lab.simulation.journey import START_NS, Journey
@@ -221,12 +221,12 @@ class SimulatedDrive:
         """True T_world_ego (4, 4) at a time."""
         return self._journey.pose(seconds_of(stamp_ns))
 
-    def messages(self, cameras: Collection[int] | None = None) -> Iterator[SensorMessage]:
+    def messages(self, cameras: Collection[int] | None = None) -> Iterator[Frame]:
         """See `Recording.messages`."""
         for entry in self._plan if cameras is None else needed(self._plan, cameras, _CAMERA, _LIDAR, _EGO):
             yield self._message(entry)
 
-    def part(self, begin: int, end: int) -> list[SensorMessage]:
+    def part(self, begin: int, end: int) -> list[Frame]:
         """Messages `begin` to `end` (excluded) of `messages()`, so that several processes can share the work."""
         return [self._message(entry) for entry in self._plan[begin:end]]
 
@@ -239,7 +239,7 @@ class SimulatedDrive:
     def _plan(self) -> list[Arrival]:
         return arrivals(self._streams, self.config.seconds)
 
-    def _message(self, entry: Arrival) -> SensorMessage:
+    def _message(self, entry: Arrival) -> Frame:
         return self._streams[entry.stream].frame(entry.number, entry.stamp_ns)
 
     def _T_ego_camera(self, time_s: float) -> Matrix4:

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from multiprocessing.synchronize import Event
 from typing import Any, Protocol
 
-from coec.io.recordings.recording_source import SensorMessage
+from coec.calibration.types import Frame
 from coec_lab.simulation.drive import Arrival
 from coec_lab.simulation.rig_drive import RigDrive, RigDriveConfig
 
@@ -27,11 +27,11 @@ class Drive(Protocol):
         """How many `messages()` there are."""
         ...
 
-    def messages(self) -> Iterator[SensorMessage]:
+    def messages(self) -> Iterator[Frame]:
         """All messages in the order of their stamps."""
         ...
 
-    def part(self, begin: int, end: int) -> list[SensorMessage]:
+    def part(self, begin: int, end: int) -> list[Frame]:
         """Messages `begin` to `end` (excluded) of `messages()`."""
         ...
 
@@ -51,7 +51,7 @@ _left: Event | None = None
 """Set when nobody waits any more for what is being made."""
 
 
-def messages_by(config: Driven, processes: int) -> Iterator[SensorMessage]:
+def messages_by(config: Driven, processes: int) -> Iterator[Frame]:
     """The messages of the drive, in the same order and the same to the byte as from its own `messages`.
 
     At most two pieces of work per process are in progress or waiting, whatever the length of the drive.
@@ -64,7 +64,7 @@ def messages_by(config: Driven, processes: int) -> Iterator[SensorMessage]:
     left = SPAWN.Event()
     with spawned(processes, _open, config, left) as pool:
         try:
-            waiting: deque[Future[list[SensorMessage]]] = deque()
+            waiting: deque[Future[list[Frame]]] = deque()
             for begin in range(0, count, PART):
                 waiting.append(pool.submit(_part, begin))
                 if len(waiting) > 2 * processes:
@@ -100,10 +100,10 @@ def _open(config: Driven, left: Event) -> None:
     _drive, _left = config.drive(), left
 
 
-def _part(begin: int) -> list[SensorMessage]:
+def _part(begin: int) -> list[Frame]:
     assert _drive is not None
     assert _left is not None
-    made: list[SensorMessage] = []
+    made: list[Frame] = []
     while len(made) < PART and not _left.is_set():
         one = _drive.part(begin + len(made), begin + len(made) + 1)
         if not one:
@@ -118,7 +118,7 @@ class FrameRenderers:
     def __init__(self, executor: Executor) -> None:
         self._executor = executor
 
-    def render(self, drive: int, entry: Arrival) -> Future[SensorMessage]:
+    def render(self, drive: int, entry: Arrival) -> Future[Frame]:
         """Draws an entry of the plan of a drive; `drive` is the index of its configuration."""
         return self._executor.submit(_rendered, drive, entry)
 
@@ -142,7 +142,7 @@ def prepare_process(configs: tuple[RigDriveConfig, ...]) -> None:
     _drives.clear()
 
 
-def _rendered(drive: int, entry: Arrival) -> SensorMessage:
+def _rendered(drive: int, entry: Arrival) -> Frame:
     if drive not in _drives:
         _drives[drive] = _configs[drive].drive()
     return _drives[drive].message(entry)

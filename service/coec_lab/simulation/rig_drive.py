@@ -21,12 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.frames.pairing import Pairer
-from coec.calibration.types import FramePair, Matrix4, Rig
+from coec.calibration.types import Frame, FramePair, Matrix4, Rig
 from coec.config import PairingConfig
 from coec.errors import UsageError
 from coec.geometry.cameras import Camera
 from coec.geometry.se3 import inverse, perturb, rotation_exp
-from coec.io.recordings.recording_source import SensorMessage
 from coec_lab.simulation import simulated_sensors
 from coec_lab.simulation.drive import Arrival, arrivals, camera_of, check_rates, lidar_of, needed, seconds_of, stamps_of
 from coec_lab.simulation.faults import Fault, SensorFault, shifted
@@ -251,16 +250,16 @@ class RigDrive:
         """Everything that arrives, in the order of the stamps. Streams are numbered: ego, LiDARs, cameras."""
         return arrivals([self._streams[name] for name in self._order], self.config.seconds)
 
-    def messages(self) -> Iterator[SensorMessage]:
+    def messages(self) -> Iterator[Frame]:
         """All frames of all sensors in the order of their stamps; `frame_id` is the name of the sensor."""
         for entry in self.plan:
             yield self.message(entry)
 
-    def part(self, begin: int, end: int) -> list[SensorMessage]:
+    def part(self, begin: int, end: int) -> list[Frame]:
         """Messages `begin` to `end` (excluded) of `messages()`, so that several processes can share the work."""
         return [self.message(entry) for entry in self.plan[begin:end]]
 
-    def message(self, entry: Arrival) -> SensorMessage:
+    def message(self, entry: Arrival) -> Frame:
         """The message of one entry of the plan."""
         return self._streams[self._order[entry.stream]].frame(entry.number, entry.stamp_ns)
 
@@ -353,7 +352,7 @@ class SimulatedRigPair:
         T_lidar_ego = self._drive.T_sensor_ego(self._lidar, stamp_ns)
         return simulated_sensors.product(self._drive.T_sensor_ego(self._camera, stamp_ns), inverse(T_lidar_ego))
 
-    def messages(self, cameras: Collection[int] | None = None) -> Iterator[SensorMessage]:
+    def messages(self, cameras: Collection[int] | None = None) -> Iterator[Frame]:
         """See `Recording.messages`."""
         of = self._drive.stream
         entries = self._plan
@@ -412,7 +411,7 @@ def instants(drive: RigDrive, lidar: str, period_s: float) -> list[Instant]:
     return result
 
 
-def pair_of(picture: SensorMessage, sweep: SensorMessage, motions: tuple[SensorMessage, ...]) -> FramePair | None:
+def pair_of(picture: Frame, sweep: Frame, motions: tuple[Frame, ...]) -> FramePair | None:
     """The pair that the service would make of a picture, a sweep and the motion around them; None if it makes none."""
     pairer = Pairer(PairingConfig(), expects_motion=True)
     pairs = []

@@ -22,8 +22,8 @@ from coec.calibration.types import Decision, DepthModel, Estimate, ImageReader, 
 from coec.config import CalibrationConfig, LimitsConfig, SearchConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3
-from coec.io.baseline_file import baseline_hash
 from coec.io.images import CachedGreys, GreyImages
+from coec.io.rig_files import baseline_hash
 from coec_lab.experiments.detection import MIN_RECORDED, interval, table, try_detection
 from support.estimates import estimate
 

@@ -11,7 +11,7 @@ import pytest
 from coec.calibration.baseline import MIN_VEHICLES, Accuracy, Baseline, for_rig, model_baseline, uncommissioned
 from coec.errors import CalibrationError
 from coec.geometry import se3
-from coec.io.baseline_file import baseline_hash
+from coec.io.rig_files import baseline_hash
 from support.estimates import a_baseline
 from support.scenes import BOARD_LENSES, board_rig
 

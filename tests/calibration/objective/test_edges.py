@@ -133,7 +133,9 @@ def with_reflectance(window: Window, values: Callable[[int, Points], NDArray[np.
     )
 
 
-def test_the_weight_of_each_kind_of_edges_is_its_mean_strength_at_a_pose(sharp_street: Window, sharp_edges: EdgeCue) -> None:
+def test_the_weight_of_a_kind_of_edges_is_its_mean_strength(
+    sharp_street: Window, sharp_edges: EdgeCue
+) -> None:
     truth = sharp_street.T_camera_lidar_start
     balanced = sharp_edges.balanced_at(truth)
     band = balanced.bands[0]

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from coec.calibration.types import CameraFrame, EncodedImage, ImageFormat
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
-from coec.io.converted_images import from_file
 from coec.io.images import decode_bgr, decode_grey, is_order_swapped, raw_image
 from coec.io.ros import message_decoding, messages
+from coec.io.ros.message_decoding import from_file
 from support.ros import compressed_image
 from support.ros import raw_image as raw_message
 

@@ -31,8 +31,17 @@ from coec.calibration.types import (
 from coec.errors import RecordingError, WindowError
 from coec.geometry import se3
 from coec.io.mcap.reader import McapDamagedError, read_records
-from coec.io.mcap.window_reader import PART_SUFFIX, is_window, pairs_since, read_result, read_window
-from coec.io.mcap.window_writer import RecordedWindow, WindowWriter, salvage, write_result
+from coec.io.mcap.windows import (
+    RecordedWindow,
+    WindowWriter,
+    is_window,
+    pairs_since,
+    read_result,
+    read_window,
+    salvage,
+    write_result,
+)
+from coec.io.mcap.writer import PART_SUFFIX
 from coec.schemas.replies import MovedWithin, Reason
 from support.readers import read_recording
 from support.windows import BLACK, CONFIGURATION, HEIGHT, WIDTH, a_pair, a_result, a_rig, a_window
@@ -619,7 +628,7 @@ import resource, signal, sys
 sys.path[:0] = {paths!r}
 from pathlib import Path
 from support.windows import CONFIGURATION, a_pair, a_result, a_rig, a_window
-from coec.io.mcap.window_writer import WindowWriter, write_result
+from coec.io.mcap.windows import WindowWriter, write_result
 from coec.errors import RecordingError
 folder, limit = Path(sys.argv[1]), int(sys.argv[2])
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # the write then fails with EFBIG, as with ENOSPC on a full disk

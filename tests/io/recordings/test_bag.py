@@ -16,8 +16,7 @@ from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame
 from coec.config import CalibrationConfig, PairingConfig, SearchConfig
 from coec.errors import SourceError, UsageError
 from coec.geometry import cameras, se3
-from coec.io.mcap.window_reader import read_window
-from coec.io.mcap.window_writer import WindowWriter
+from coec.io.mcap.windows import WindowWriter, read_window
 from coec.io.recordings.layouts import open_source
 from support.recordings import (
     HEIGHT,

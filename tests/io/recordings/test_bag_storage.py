@@ -14,10 +14,9 @@ from mcap.writer import CompressionType
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from ruamel.yaml import YAML
 
-from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
+from coec.calibration.types import CameraFrame, EgoMotion, Frame, LidarFrame
 from coec.errors import SourceError, WindowError
 from coec.io.recordings.layouts import open_source
-from coec.io.recordings.recording_source import SensorMessage
 from support.recordings import STORE, Bag, compressed_image_message, drive_messages
 
 SQLITE, MCAP = StoragePlugin.SQLITE3, StoragePlugin.MCAP
@@ -44,7 +43,7 @@ def a_folder(
     return path
 
 
-def reported(message: SensorMessage) -> tuple[object, ...]:
+def reported(message: Frame) -> tuple[object, ...]:
     match message:
         case CameraFrame():
             return message.stamp_ns, message.image.data
@@ -218,9 +217,8 @@ def test_a_schema_that_makes_messages_up_is_refused(
 def test_a_bag_that_grows_without_end_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: CompressionMode
 ) -> None:
-    monkeypatch.setattr("coec.io.recordings.bag_folder.MAX_RATIO", 2)
     monkeypatch.setattr("coec.io.recordings.bag_storage.MAX_RATIO", 2)
-    monkeypatch.setattr("coec.io.recordings.bag_folder.MAX_UNPACKED_MESSAGE_BYTES", 30_000)
+    monkeypatch.setattr("coec.io.recordings.bag_storage.MAX_UNPACKED_MESSAGE_BYTES", 30_000)
     monkeypatch.setattr("coec.io.recordings.bag_storage.MAX_CHUNK_BYTES", 30_000)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     zeros = replace(compressed_image_message(5), data=np.zeros(20_000, np.uint8))

@@ -9,7 +9,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from coec.config import LimitsConfig
 from coec.errors import SourceError, UsageError
-from coec.io.mcap.bag_writer import write_bag
+from coec.io.mcap.writer import write_bag
 from coec.io.recordings.bag import open_topics
 from coec.io.recordings.layouts import open_source
 from coec.io.recordings.recording_source import parse_spec

@@ -21,7 +21,7 @@ from coec.calibration.frames.pairing import Pairer
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
 from coec.config import CalibrationConfig, LimitsConfig, PairingConfig
 from coec.errors import DecodeError, SourceError
-from coec.io.mcap.window_writer import WindowWriter
+from coec.io.mcap.windows import WindowWriter
 from coec.io.recordings.bag import open_topics
 from coec.io.recordings.layouts import open_source
 from coec.io.recordings.recording_source import RecordingSource, parse_spec

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from coec.errors import ConfigError
-from coec.io.zenoh.endpoints import Endpoint, redacted, without_secrets
+from coec.io.zenoh.session import Endpoint, redacted, without_secrets
 
 KEY = "tls/vehicle:7448#connect_private_key_base64=c2VjcmV0;enable_mtls=true"
 

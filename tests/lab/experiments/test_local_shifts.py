@@ -14,7 +14,7 @@ from coec.errors import CalibrationError
 from coec.geometry import se3
 from coec.geometry.cameras import Camera, build
 from coec.io.images import GreyImages
-from coec.reports.residual_map import LocalShifts, local_shifts
+from coec.reports.pictures import LocalShifts, local_shifts
 from support import scenes
 
 POSTS_DEG = tuple(np.arange(-36.0, 37.0, 4.0).tolist())

@@ -15,7 +15,7 @@ from coec.geometry import se3
 from coec.geometry.cameras import build
 from coec.geometry.projection import project
 from coec.io.images import GreyImages
-from coec.reports.difference_regions import DifferenceRegions, difference_regions, outlines_of, shift_px
+from coec.reports.close_ups import DifferenceRegions, difference_regions, outlines_of, shift_px
 from support import scenes
 
 SIZE_PX = (90, 60)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 pytest.importorskip("embreex", reason="needs embreex")
 
 from coec.calibration.frames.motion_compensation import compensate
-from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame
+from coec.calibration.types import CameraFrame, EgoMotion, Frame, FramePair, LidarFrame
 from coec.config import LimitsConfig
 from coec.errors import UsageError
 from coec.geometry import cameras
@@ -21,7 +21,6 @@ from coec.geometry.cameras import in_image
 from coec.geometry.projection import project
 from coec.geometry.se3 import difference, exp
 from coec.io.images import decode_depth
-from coec.io.recordings.recording_source import SensorMessage
 from coec_lab.simulation import parallel
 from coec_lab.simulation.drive import DriveConfig, SimulatedDrive
 from coec_lab.simulation.faults import parse_fault
@@ -40,13 +39,13 @@ def small(*faults: str, seconds: float = 1.0, depth: bool = False, **more: objec
 
 
 @lru_cache(maxsize=1)
-def plain() -> tuple[SensorMessage, ...]:
+def plain() -> tuple[Frame, ...]:
     """The drive without any fault."""
     return tuple(small().messages())
 
 
-def fingerprint(messages: Iterable[SensorMessage]) -> list[object]:
-    def of(message: SensorMessage) -> object:
+def fingerprint(messages: Iterable[Frame]) -> list[object]:
+    def of(message: Frame) -> object:
         match message:
             case CameraFrame():
                 return message.stamp_ns, message.sequence, message.image.data, message.depth and message.depth.data
@@ -58,11 +57,11 @@ def fingerprint(messages: Iterable[SensorMessage]) -> list[object]:
     return [of(message) for message in messages]
 
 
-def pictures(messages: Iterable[SensorMessage]) -> list[CameraFrame]:
+def pictures(messages: Iterable[Frame]) -> list[CameraFrame]:
     return [message for message in messages if isinstance(message, CameraFrame)]
 
 
-def sweeps(messages: Iterable[SensorMessage]) -> list[LidarFrame]:
+def sweeps(messages: Iterable[Frame]) -> list[LidarFrame]:
     return [message for message in messages if isinstance(message, LidarFrame)]
 
 

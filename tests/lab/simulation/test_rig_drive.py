@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("embreex", reason="needs embreex")
 
 from coec.calibration.frames.motion_compensation import compensate
-from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame
+from coec.calibration.types import CameraFrame, EgoMotion, Frame, FramePair, LidarFrame
 from coec.config import LimitsConfig
 from coec.errors import UsageError
 from coec.geometry.cameras import in_image
@@ -19,7 +19,7 @@ from coec.geometry.projection import project
 from coec.geometry.se3 import difference, inverse
 from coec.io.images import decode_depth
 from coec.io.recordings.layouts import open_source
-from coec.io.recordings.recording_source import HasGroundTruth, SensorMessage
+from coec.io.recordings.recording_source import HasGroundTruth
 from coec_lab.simulation.journey import START_NS
 from coec_lab.simulation.rig_drive import RigDrive, SimulatedRigPair
 from coec_lab.simulation.scene import Solid
@@ -38,12 +38,12 @@ def drive(*faults: str, **more: str) -> RigDrive:
 
 
 @lru_cache(maxsize=1)
-def plain() -> tuple[SensorMessage, ...]:
+def plain() -> tuple[Frame, ...]:
     """The drive without any fault."""
     return tuple(drive(depth="yes").messages())
 
 
-def content(message: SensorMessage) -> object:
+def content(message: Frame) -> object:
     match message:
         case CameraFrame():
             return message.frame_id, message.stamp_ns, message.image.data
@@ -52,7 +52,7 @@ def content(message: SensorMessage) -> object:
     return message
 
 
-def by_sensor(messages: tuple[SensorMessage, ...] | list[SensorMessage]) -> dict[str, SensorMessage]:
+def by_sensor(messages: tuple[Frame, ...] | list[Frame]) -> dict[str, Frame]:
     """The first of each."""
     return {message.frame_id: message for message in reversed(messages)}
 

@@ -80,15 +80,15 @@ def test_health_is_published_when_its_reasons_change_and_not_otherwise(pending: 
 @pytest.mark.parametrize(
     "query",
     [
-        lambda a: a.extrinsic("json"),
-        lambda a: a.exported("urdf", ExportFrames(None, None)),
-        lambda a: a.history(0, 2**63 - 1, 10),
-        lambda a: a.windows("json"),
-        lambda a: a.read_window("front-1", 0, 1),
-        lambda a: a.events(),
-        lambda a: a.event("1"),
-        lambda a: a.event_overlay("1", "before"),
-        lambda a: a.overlay(None, nominal=True),
+        lambda a: a.calibrated.extrinsic("json"),
+        lambda a: a.calibrated.exported("urdf", ExportFrames(None, None)),
+        lambda a: a.calibrated.history(0, 2**63 - 1, 10),
+        lambda a: a.calibrated.windows("json"),
+        lambda a: a.calibrated.read_window("front-1", 0, 1),
+        lambda a: a.calibrated.events(),
+        lambda a: a.calibrated.event("1"),
+        lambda a: a.calibrated.event_overlay("1", "before"),
+        lambda a: a.calibrated.overlay(None, nominal=True),
     ],
 )
 def test_every_other_question_ends_in_an_error_that_says_what_is_missing(

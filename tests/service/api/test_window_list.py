@@ -13,7 +13,7 @@ import pytest
 from pydantic import BaseModel
 
 from coec.config import StateConfig
-from coec.io.mcap.window_writer import RecordedWindow
+from coec.io.mcap.windows import RecordedWindow
 from coec.io.zenoh.bus import Answer
 from coec.schemas.keys import Format
 from coec.schemas.message import from_msgpack
@@ -79,7 +79,7 @@ def test_a_list_of_thousands_is_packed_once(
         packed += 1
         return answer_of(model, form)
 
-    monkeypatch.setattr("coec.service.api.pair_answers.answer_of", counted)
+    monkeypatch.setattr("coec.service.api.reply_builders.answer_of", counted)
     reported = WindowsList("v7", "front", WindowStore(folder, StateConfig(min_free_bytes=0)), None)
     took_s = []
     for _ in range(20):

@@ -27,8 +27,7 @@ from coec.service.engine.pair import Pair
 from coec.service.engine.pair_stream import PairStream
 from coec.service.engine.rig import RigEstimator
 from coec.service.engine.vehicle import Vehicle
-from coec.service.ingest.decoder import CAMERA, EGO, LIDAR
-from coec.service.ingest.sensor_stream import FRAMES_WAITING, read_alike
+from coec.service.ingest.decoder import CAMERA, EGO, FRAMES_WAITING, LIDAR, read_alike
 from coec.service.recording.recorder import Recorder
 from coec.service.vehicle_context import VehicleContext
 from support.vehicles import HEIGHT, WIDTH, pair_configuration

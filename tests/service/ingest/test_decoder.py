@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from coec.calibration.frames.pairing import Pairer
-from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame
+from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, Frame, ImageFormat, LidarFrame
 from coec.config import (
     IDENTITY,
     CameraConfig,
@@ -28,10 +28,9 @@ from coec.io.ros import message_encoding
 from coec.io.zenoh.bus import InputSample
 from coec.io.zenoh.ros_node import RosTopicList
 from coec.service.api.problems import stream_problems
-from coec.service.ingest.decoder import CAMERA, EGO, LIDAR, RECENT, Decoder, Frame
+from coec.service.ingest.decoder import CAMERA, EGO, LIDAR, RECENT, Decoder, SensorStream
 from coec.service.ingest.frame_buffers import FrameBudget
 from coec.service.ingest.inbox import Inbox, Parcel, Posted
-from coec.service.ingest.sensor_stream import SensorStream
 from support.ros import packed_cloud, transforms
 from support.scenes import ROOF_POSE, sweep_in_frame, turning_sweep
 

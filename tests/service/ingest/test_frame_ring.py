@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame
+from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, Frame, ImageFormat, LidarFrame
 from coec.config import SnippetsConfig
-from coec.service.ingest.decoder import Frame
 from coec.service.ingest.frame_buffers import SILENT_S, FrameRing, Snippet, frame_bytes
 
 S = 1_000_000_000

@@ -16,8 +16,15 @@ from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFo
 from coec.config import CalibrationConfig, StateConfig
 from coec.geometry.cameras import build
 from coec.io.logs import LossCounter
-from coec.io.mcap.window_reader import read_window
-from coec.service.recording.recorder import Recorder, RecordingPlan, RecordingThread, WindowLost, WindowRecorded
+from coec.io.mcap.windows import read_window
+from coec.service.recording.recorder import (
+    Recorder,
+    RecordingPlan,
+    RecordingThread,
+    RecordPair,
+    WindowLost,
+    WindowRecorded,
+)
 from coec.service.recording.window_store import WindowStore
 from support.disk import FullDisk
 from support.fake_worker import wait_until
@@ -61,7 +68,7 @@ class Life:
         """Whether a window of three pairs came to the disk; every window comes to one end."""
         name, before = f"front-{start_ns}", len(self.recorded) + len(self.lost)
         for stamp_ns in range(start_ns, start_ns + 3):
-            self.recorder.add(name, pair(stamp_ns), NOMINAL)
+            self.recorder.add(RecordPair(name, pair(stamp_ns), NOMINAL))
         self.recorder.end(SliceClosed(name, 3, True))
         wait_until(lambda: len(self.recorded) + len(self.lost) > before, "the end of the window")
         return name in self.recorded

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coec.io.mcap.window_reader import read_window
+from coec.io.mcap.windows import read_window
 from coec.io.recordings.bag import open_bag
 from coec.io.recordings.recording_source import parse_spec
 from conftest import REPOSITORY

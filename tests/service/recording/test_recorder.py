@@ -23,16 +23,17 @@ from coec.config import CalibrationConfig, StateConfig
 from coec.errors import RecordingError
 from coec.geometry.cameras import build
 from coec.io.logs import LossCounter
-from coec.io.mcap.window_reader import read_window
-from coec.io.mcap.window_writer import WindowWriter
+from coec.io.mcap.windows import WindowWriter, read_window
 from coec.service.recording.recorder import (
     BETWEEN_WAITING,
     PAIRS_WAITING,
     STUCK_S,
     UNSOLVED_RESUMED,
+    RecordBetween,
     Recorder,
     RecordingPlan,
     RecordingThread,
+    RecordPair,
     WindowLost,
     WindowRecorded,
 )
@@ -101,7 +102,7 @@ class Bench:
 
     def window(self, name: str, stamps: list[int]) -> None:
         for stamp_ns in stamps:
-            self.recorder.add(name, pair(stamp_ns), NOMINAL)
+            self.recorder.add(RecordPair(name, pair(stamp_ns), NOMINAL))
         self.recorder.end(SliceClosed(name, len(stamps), len(stamps) >= MIN_PAIRS))
 
     def files(self) -> list[str]:
@@ -129,9 +130,9 @@ def test_a_window_is_written_and_reported(bench: Bench) -> None:
 
 def test_a_window_is_calibrated_by_what_held_when_it_began(bench: Bench) -> None:
     later = CalibrationConfig(motion_compensation=False)
-    bench.recorder.add("front-10", pair(10), NOMINAL)
+    bench.recorder.add(RecordPair("front-10", pair(10), NOMINAL))
     bench.recorder.reconfigure(later)
-    bench.recorder.add("front-10", pair(20), NOMINAL)
+    bench.recorder.add(RecordPair("front-10", pair(20), NOMINAL))
     bench.recorder.end(SliceClosed("front-10", 2, True))
     bench.window("front-30", [30, 40])
     with bench.running():
@@ -153,7 +154,7 @@ def test_a_window_says_by_which_settings_it_was_taken(bench: Bench) -> None:
     first, then = (replace(PLAN, metadata={"settings_hash": name}) for name in ("first", "then"))
     bench.recorder.follow(first)
     with bench.running():
-        bench.recorder.add("front-10", pair(10), NOMINAL)
+        bench.recorder.add(RecordPair("front-10", pair(10), NOMINAL))
         wait_until(lambda: bench.recorder.waiting == 0 and bench.files() != [], "the first pair")
         bench.recorder.follow(replace(then, min_pairs=3))
         bench.window("front-10", [20])
@@ -178,7 +179,7 @@ def test_a_window_takes_what_an_earlier_one_keeps_for_it_from_the_disk(bench: Be
     retained = CarriedOverPairs("front-10", 20, 30, 2)
     with bench.running():
         bench.window("front-10", [10, 20, 30])
-        bench.recorder.add("front-50", pair(50), NOMINAL)
+        bench.recorder.add(RecordPair("front-50", pair(50), NOMINAL))
         bench.recorder.end(SliceClosed("front-50", 3, True, retained))
         names = [bench.recorded.get(timeout=DEADLINE_S)[0] for _ in range(2)]
         assert names == ["front-10", "front-50"]
@@ -189,14 +190,14 @@ def test_a_window_takes_what_an_earlier_one_keeps_for_it_from_the_disk(bench: Be
 
 def test_pairs_between_are_recorded_next_to_those_of_the_open_window_and_do_not_count(bench: Bench) -> None:
     with bench.running():
-        bench.recorder.add_between("front-10", pair(5))
-        bench.recorder.add("front-10", pair(10), NOMINAL)
-        bench.recorder.add_between("front-10", pair(15))
-        bench.recorder.add("front-10", pair(20), NOMINAL)
-        bench.recorder.add_between("front-10", pair(25))
+        bench.recorder.add(RecordBetween("front-10", pair(5)))
+        bench.recorder.add(RecordPair("front-10", pair(10), NOMINAL))
+        bench.recorder.add(RecordBetween("front-10", pair(15)))
+        bench.recorder.add(RecordPair("front-10", pair(20), NOMINAL))
+        bench.recorder.add(RecordBetween("front-10", pair(25)))
         bench.recorder.end(SliceClosed("front-10", 2, True))
-        bench.recorder.add("front-40", pair(40), NOMINAL)
-        bench.recorder.add_between("front-40", pair(45))
+        bench.recorder.add(RecordPair("front-40", pair(40), NOMINAL))
+        bench.recorder.add(RecordBetween("front-40", pair(45)))
         bench.recorder.end(SliceClosed("front-40", 1, False))
         assert bench.recorded.get(timeout=DEADLINE_S)[0] == "front-10"
     window, _ = read_window(bench.store.path("front-10"))
@@ -212,7 +213,7 @@ def test_retained_pairs_that_are_gone_are_counted_and_cost_no_window(bench: Benc
     with bench.running():
         for name, stamps in (("front-50", [50, 60]), ("front-70", [70])):
             for stamp_ns in stamps:
-                bench.recorder.add(name, pair(stamp_ns), NOMINAL)
+                bench.recorder.add(RecordPair(name, pair(stamp_ns), NOMINAL))
             bench.recorder.end(SliceClosed(name, len(stamps) + 3, True, CarriedOverPairs("front-10", 20, 30, 3)))
         assert bench.recorded.get(timeout=DEADLINE_S)[0] == "front-50"
     assert bench.files() == ["front-50.mcap"]
@@ -222,7 +223,7 @@ def test_retained_pairs_that_are_gone_are_counted_and_cost_no_window(bench: Benc
 
 def test_a_stop_finishes_the_open_window(bench: Bench) -> None:
     for stamp_ns in (10, 20):
-        bench.recorder.add("front-10", pair(stamp_ns), NOMINAL)
+        bench.recorder.add(RecordPair("front-10", pair(stamp_ns), NOMINAL))
     with bench.running():
         pass
     assert bench.files() == ["front-10.mcap"]
@@ -230,7 +231,7 @@ def test_a_stop_finishes_the_open_window(bench: Bench) -> None:
 
 
 def test_a_stop_abandons_an_open_window_with_too_few_pairs(bench: Bench) -> None:
-    bench.recorder.add("front-10", pair(10), NOMINAL)
+    bench.recorder.add(RecordPair("front-10", pair(10), NOMINAL))
     with bench.running():
         pass
     assert bench.files() == []
@@ -246,15 +247,15 @@ def test_pairs_beyond_the_queue_are_counted_and_the_end_still_comes(bench: Bench
 
 
 def test_pairs_between_take_no_place_of_those_of_a_window_in_the_queue(bench: Bench) -> None:
-    bench.recorder.add("front-1", pair(1), NOMINAL)
+    bench.recorder.add(RecordPair("front-1", pair(1), NOMINAL))
     for stamp_ns in range(2, 2 + BETWEEN_WAITING):
         assert bench.recorder.has_room
-        bench.recorder.add_between("front-1", pair(stamp_ns))
+        bench.recorder.add(RecordBetween("front-1", pair(stamp_ns)))
     assert not bench.recorder.has_room, "the stream waits, and a replay at any rate records the same"
     assert bench.recorder.waiting == 1
-    bench.recorder.add_between("front-1", pair(100))
+    bench.recorder.add(RecordBetween("front-1", pair(100)))
     assert bench.losses.snapshot() == {("window", "recorder_overrun"): 1}
-    bench.recorder.add("front-1", pair(200), NOMINAL)
+    bench.recorder.add(RecordPair("front-1", pair(200), NOMINAL))
     bench.recorder.end(SliceClosed("front-1", 2, True))
     with bench.running():
         _, path, _ = bench.recorded.get(timeout=DEADLINE_S)

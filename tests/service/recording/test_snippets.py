@@ -14,14 +14,22 @@ import cv2
 import numpy as np
 import pytest
 
-from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame, Rig, SweepTiming
+from coec.calibration.types import (
+    CameraFrame,
+    EgoMotion,
+    EncodedImage,
+    Frame,
+    ImageFormat,
+    LidarFrame,
+    Rig,
+    SweepTiming,
+)
 from coec.errors import NotFoundError, UsageError
 from coec.geometry.cameras import build
 from coec.io.logs import LossCounter
-from coec.io.mcap.bag_writer import SnippetFile
+from coec.io.mcap.writer import SnippetFile
 from coec.io.recordings.bag import open_bag
 from coec.io.recordings.recording_source import parse_spec
-from coec.service.ingest.decoder import Frame
 from coec.service.ingest.frame_buffers import Snippet
 from coec.service.recording.snippets import SnippetRecorder, SnippetStore
 from support.disk import FullDisk

@@ -15,7 +15,7 @@ import pytest
 
 from coec.config import StateConfig
 from coec.errors import NotFoundError, RecordingError, UsageError
-from coec.io.mcap.window_writer import RecordedWindow
+from coec.io.mcap.windows import RecordedWindow
 from coec.service.recording import window_store
 from coec.service.recording.window_store import EXPIRED_AT_ONCE, WindowStore, WindowVersion
 from support.disk import EVERY_OPERATION, Disk

@@ -27,7 +27,6 @@ from coec.service.worker.worker_jobs import (
     Solved,
     number_of,
     pack_answer,
-    pack_refusal,
     read_answer,
 )
 from support.estimates import ESTIMATE_RIG, estimate
@@ -120,7 +119,7 @@ def test_a_commissioning_and_a_picture_survive() -> None:
 
 
 def test_a_refusal_is_reported_whatever_was_requested_and_a_prefetch_is_answered_with_nothing() -> None:
-    refusal = over_the_wire(pack_refusal(9, Reason("bad_window", "empty")))
+    refusal = over_the_wire(pack_answer(9, Reason("bad_window", "empty")))
     assert number_of(refusal) == 9
     for kind in (*Kind, None):
         assert read_answer(refusal, kind) == Reason("bad_window", "empty")

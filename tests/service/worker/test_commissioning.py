@@ -17,9 +17,9 @@ from coec.calibration.types import Window
 from coec.cli.convert import configuration_for
 from coec.config import CalibrationConfig, Config, DepthConfig, LimitsConfig, SearchConfig, StateConfig
 from coec.errors import CalibrationError
-from coec.io.baseline_file import BASELINES, baseline_hash, load_baseline
 from coec.io.images import GreyImages
-from coec.io.mcap.window_writer import WindowWriter
+from coec.io.mcap.windows import WindowWriter
+from coec.io.rig_files import BASELINES, baseline_hash, load_baseline
 from coec.service.worker import tasks
 from coec.service.worker.tasks import Solver
 from coec.service.worker.worker_jobs import DEADLINE_S, Commissioned, Kind, Underway, pack_pairs

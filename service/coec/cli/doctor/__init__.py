@@ -15,6 +15,8 @@ import typer
 
 from coec.cli.options import Json
 from coec.errors import ConfigError, ModelError
+from coec.reports import console
+from coec.reports.formatting import count
 
 if TYPE_CHECKING:
     import zenoh
@@ -42,7 +44,6 @@ def doctor(
     Checks the configuration, disk, clock, certificates, router and its rules, streams, and the running service if
     there is one; changes and disturbs nothing.
     """
-    from coec.reports import console
     from coec.schemas.documents import DoctorReport
 
     findings: list[Finding] = []
@@ -103,8 +104,6 @@ def _received(config: Config, session: zenoh.Session, client: zenoh.Session, sec
     """Findings on what a session as that of the service receives, compared with a client of the same router."""
     from coec.cli.doctor import streams
     from coec.io.zenoh.ros_node import RosSide
-    from coec.reports import console
-    from coec.reports.formatting import count
 
     ros, known = RosSide(session, config), RosSide(client, config)
     with console.progress(counted=False) as progress:
@@ -128,8 +127,7 @@ def _configuration(path: Path) -> tuple[Config | None, Finding]:
     from coec.cli.doctor.environment import fail, ok
     from coec.config import load_config
     from coec.io.rig_files import check_given, rig_of
-    from coec.io.zenoh.endpoints import Endpoint
-    from coec.io.zenoh.session import connected_of, listened_of, settings_of
+    from coec.io.zenoh.session import Endpoint, connected_of, listened_of, settings_of
     from coec.service.discovery import with_discovered
 
     advice = "correct it, or name another with --config; `coec check-config FILE` prints what a file comes to"
@@ -175,8 +173,6 @@ def _networks(config: Config) -> Iterator[Finding]:
 
 def _show(finding: Finding) -> None:
     from rich.text import Text
-
-    from coec.reports import console
 
     line = Text(f"{finding.level:<5}", STYLES[finding.level])
     line.append(f"{finding.check:<14}", "")

@@ -22,22 +22,9 @@ from coec import __version__
 from coec.config import Config, StateConfig
 from coec.errors import CoecError, NotFoundError, UnavailableError
 from coec.io.system import clock_state, lock_holder
+from coec.io.zenoh import session as zenoh_session
 from coec.io.zenoh.bus import closed, is_connected, open_session
-from coec.io.zenoh.endpoints import (
-    CERTIFIED,
-    WITH_PORT,
-    Certificate,
-    CertificateError,
-    Endpoint,
-    host_and_port,
-    read_certificate,
-    redacted,
-    shake_hands,
-    tls_files,
-)
 from coec.io.zenoh.query_client import query_all, query_one
-from coec.io.zenoh.session import connected_of, finds_peers, listened_of, mode_of, open_client, settings_of
-from coec.io.zenoh.session import to_observer as as_separate_client
 from coec.schemas.documents import Finding, Level
 from coec.schemas.keys import Keys
 from coec.schemas.message import from_json, json_value
@@ -228,46 +215,46 @@ LEVELS: dict[int, Level] = {0: "ok", 1: "warn", 2: "fail", 3: "warn"}
 
 def certificate_findings(config: Config) -> Iterator[Finding]:
     """Findings on the certificates that the service shows, read from the disk."""
-    settings = settings_of(config.zenoh, config.limits)
+    settings = zenoh_session.settings_of(config.zenoh, config.limits)
     seen: set[str] = set()
     roles: tuple[tuple[Literal["connect", "listen"], tuple[str, ...]], ...] = (
-        ("connect", connected_of(settings)),
-        ("listen", listened_of(settings)),
+        ("connect", zenoh_session.connected_of(settings)),
+        ("listen", zenoh_session.listened_of(settings)),
     )
     for role, endpoints in roles:
-        for endpoint in (Endpoint.parse(text) for text in endpoints):
-            material = tls_files(settings, endpoint, role)
+        for endpoint in (zenoh_session.Endpoint.parse(text) for text in endpoints):
+            material = zenoh_session.tls_files(settings, endpoint, role)
             where = str(material.certificate)
-            if endpoint.protocol not in CERTIFIED or material.certificate is None or where in seen:
+            if endpoint.protocol not in zenoh_session.CERTIFIED or material.certificate is None or where in seen:
                 continue
             seen.add(where)
             try:
-                yield _dated("certificate", where, read_certificate(material, role))
-            except CertificateError as error:
+                yield _dated("certificate", where, zenoh_session.read_certificate(material, role))
+            except zenoh_session.CertificateError as error:
                 advice = "have the authority that the router trusts issue a new one; see `deploy/`"
                 yield fail("certificate", where, str(error), advice)
 
 
 def router_findings(config: Config) -> Iterator[Finding]:
     """Findings on every endpoint of the router, each as far as it answers."""
-    settings = settings_of(config.zenoh, config.limits)
+    settings = zenoh_session.settings_of(config.zenoh, config.limits)
     for text in _endpoints(settings, config):
-        endpoint = Endpoint.parse(text)
-        if endpoint.protocol in WITH_PORT and endpoint.protocol in OVER_TCP:
-            yield from _reached(settings, endpoint, redacted(text))
+        endpoint = zenoh_session.Endpoint.parse(text)
+        if endpoint.protocol in zenoh_session.WITH_PORT and endpoint.protocol in OVER_TCP:
+            yield from _reached(settings, endpoint, zenoh_session.redacted(text))
         else:
-            yield ok("router", redacted(text), "only Zenoh can check whether this endpoint answers")
+            yield ok("router", zenoh_session.redacted(text), "only Zenoh can check whether this endpoint answers")
 
 
 def session_of_client(config: Config) -> zenoh.Session | None:
     """A client session with the router that uses the certificate of the service; None when none comes about."""
     zenoh.init_log_from_env_or("off")
-    settings = settings_of(config.zenoh, config.limits)
+    settings = zenoh_session.settings_of(config.zenoh, config.limits)
     endpoints = _endpoints(settings, config)
-    settings = as_separate_client(settings)
+    settings = zenoh_session.to_observer(settings)
     settings.insert_json5("connect/endpoints", json.dumps(endpoints))
     try:
-        return open_client(settings, CONNECT_S)
+        return zenoh_session.open_client(settings, CONNECT_S)
     except zenoh.ZError:
         return None
 
@@ -275,7 +262,7 @@ def session_of_client(config: Config) -> zenoh.Session | None:
 def session_as_of_service(config: Config) -> zenoh.Session | None:
     """A session as the service opens it, which therefore receives what the service receives; None when none comes
     about. Where the service is the router itself: a client of it."""
-    if mode_of(settings_of(config.zenoh, config.limits)) == "router":
+    if zenoh_session.mode_of(zenoh_session.settings_of(config.zenoh, config.limits)) == "router":
         return session_of_client(config)
     zenoh.init_log_from_env_or("off")
     try:
@@ -293,7 +280,10 @@ def session_as_of_service(config: Config) -> zenoh.Session | None:
 
 def session_finding(config: Config, session: zenoh.Session | None) -> Finding:
     """Whether what answers is a Zenoh router that accepts this session."""
-    where = ", ".join(redacted(text) for text in _endpoints(settings_of(config.zenoh, config.limits), config))
+    where = ", ".join(
+        zenoh_session.redacted(text)
+        for text in _endpoints(zenoh_session.settings_of(config.zenoh, config.limits), config)
+    )
     if session is None:
         return fail(
             "session",
@@ -308,14 +298,14 @@ def session_finding(config: Config, session: zenoh.Session | None) -> Finding:
 
 def mode_finding(config: Config) -> Finding:
     """How the service takes part, and from whom it therefore receives."""
-    settings = settings_of(config.zenoh, config.limits)
-    mode = mode_of(settings)
+    settings = zenoh_session.settings_of(config.zenoh, config.limits)
+    mode = zenoh_session.mode_of(settings)
     where = "zenoh" if config.zenoh.file is None else str(config.zenoh.file)
     if mode == "router":
         return ok("mode", where, "the service is the router itself: it receives from clients and from peers")
     if mode == "client":
         return ok("mode", where, "the service is a client: it receives from clients and peers of its router")
-    if finds_peers(settings):
+    if zenoh_session.finds_peers(settings):
         text = "the service is a peer: it receives from clients of its router, and from peers that gossip makes known"
         return ok("mode", where, text)
     cause, advice = cause_of_silence(config)
@@ -324,12 +314,12 @@ def mode_finding(config: Config) -> Finding:
 
 def cause_of_silence(config: Config) -> tuple[str, str]:
     """Why the service does not receive what a client of the same router receives, and what to do about it."""
-    settings = settings_of(config.zenoh, config.limits)
-    if mode_of(settings) != "peer":
+    settings = zenoh_session.settings_of(config.zenoh, config.limits)
+    if zenoh_session.mode_of(settings) != "peer":
         advice = "check the router's rules for this certificate (docs/security.md)"
         return "the router forwards it to others", advice
     client = "leave `mode`, `listen` and `scouting` out of zenoh.file, so that the service is a client"
-    if finds_peers(settings):
+    if zenoh_session.finds_peers(settings):
         cause = (
             "the service is a peer: a router forwards nothing to it from other peers, and it is not connected to them"
         )
@@ -367,13 +357,13 @@ def rules_finding(config: Config, session: zenoh.Session, other: zenoh.Session) 
 
 def _endpoints(settings: zenoh.Config, config: Config) -> tuple[str, ...]:
     """Endpoints of the router that the service uses, or that it is itself."""
-    if mode_of(settings) != "router":
-        return connected_of(settings)
+    if zenoh_session.mode_of(settings) != "router":
+        return zenoh_session.connected_of(settings)
     return tuple(text.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for text in config.zenoh.router)
 
 
-def _reached(settings: zenoh.Config, endpoint: Endpoint, where: str) -> Iterator[Finding]:
-    host, port = host_and_port(endpoint)
+def _reached(settings: zenoh.Config, endpoint: zenoh_session.Endpoint, where: str) -> Iterator[Finding]:
+    host, port = zenoh_session.host_and_port(endpoint)
     try:
         with closing(socket.create_connection((host, port), CONNECT_S)):
             pass
@@ -392,14 +382,14 @@ def _reached(settings: zenoh.Config, endpoint: Endpoint, where: str) -> Iterator
         yield fail("router", where, f"cannot be reached: {error.strerror or error}", "check the network")
         return
     yield ok("router", where, "accepts connections")
-    if endpoint.protocol in CERTIFIED:
+    if endpoint.protocol in zenoh_session.CERTIFIED:
         yield _handshake(settings, endpoint, where)
 
 
-def _handshake(settings: zenoh.Config, endpoint: Endpoint, where: str) -> Finding:
+def _handshake(settings: zenoh.Config, endpoint: zenoh_session.Endpoint, where: str) -> Finding:
     try:
-        seen = shake_hands(endpoint, tls_files(settings, endpoint, "connect"), CONNECT_S)
-    except CertificateError as error:
+        seen = zenoh_session.shake_hands(endpoint, zenoh_session.tls_files(settings, endpoint, "connect"), CONNECT_S)
+    except zenoh_session.CertificateError as error:
         advice = (
             "compare the authority here (root_ca_certificate) with who signed the router's certificate, the host with "
             "its names, and the other way round"
@@ -410,7 +400,7 @@ def _handshake(settings: zenoh.Config, endpoint: Endpoint, where: str) -> Findin
     return _dated("tls", where, seen)
 
 
-def _dated(check: str, where: str, seen: Certificate) -> Finding:
+def _dated(check: str, where: str, seen: zenoh_session.Certificate) -> Finding:
     """Whether a certificate is valid today, and for how long."""
     now_s = time.time()
     text = f"{seen.name!r}, valid until {_day(seen.not_after_s)}"

@@ -15,7 +15,7 @@ from typing import get_args
 import numpy as np
 import zenoh
 
-from coec.calibration.types import CameraFrame, LidarFrame
+from coec.calibration.types import CameraFrame, Frame, LidarFrame
 from coec.cli.doctor.environment import cause_of_silence, fail, ok, warn
 from coec.config import CameraMessage, Config, EgoMessage, LidarMessage, PairConfig
 from coec.errors import DecodeError
@@ -29,7 +29,7 @@ from coec.schemas.documents import Finding
 from coec.schemas.keys import TF_STATIC
 from coec.service.api.problems import PROBLEMS, stream_problems
 from coec.service.discovery import info_topic_of, needs_transforms
-from coec.service.ingest.decoder import CAMERA, EGO, LIDAR, Decoder, Frame, StreamCounts
+from coec.service.ingest.decoder import CAMERA, EGO, LIDAR, Decoder, StreamCounts
 
 SAMPLES_WAITING = 8
 """Most samples of a stream that wait to be decoded; further ones are only counted."""

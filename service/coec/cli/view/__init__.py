@@ -11,17 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from coec.cli.options import (
-    SOURCE_HELP,
-    Connect,
-    RouterTimeout,
-    ServiceAddress,
-    SessionFile,
-    pair_named,
-    service_address,
-    until_signal,
-)
+from coec.cli import options
 from coec.errors import UsageError
+from coec.reports import console
+from coec.schemas.keys import Keys
 
 if TYPE_CHECKING:
     from coec.calibration.types import Rig
@@ -41,16 +34,17 @@ class ListenAddress:
 
 def view(
     source: Annotated[
-        str | None, typer.Argument(metavar="SOURCE", help=f"Recording to play: {SOURCE_HELP}", show_default=False)
+        str | None,
+        typer.Argument(metavar="SOURCE", help=f"Recording to play: {options.SOURCE_HELP}", show_default=False),
     ] = None,
     config: Annotated[
         Path | None,
         typer.Option(help="Instead, show the running vehicle of this configuration.", metavar="FILE"),
     ] = None,
     pair: Annotated[str | None, typer.Option(help="Pair of the configuration, if there are several.")] = None,
-    connect: Connect = None,
-    zenoh: SessionFile = None,
-    timeout_s: RouterTimeout = 5.0,
+    connect: options.Connect = None,
+    zenoh: options.SessionFile = None,
+    timeout_s: options.RouterTimeout = 5.0,
     result: Annotated[
         Path | None, typer.Option(help="Output of `calibrate --json`, shown as the candidate.", metavar="FILE")
     ] = None,
@@ -81,7 +75,7 @@ def view(
     if config is not None:
         if result is not None or repeat or rate != 1.0:
             raise UsageError("--result, --rate and --repeat are about a SOURCE: a vehicle has its own")
-        service = service_address(config, None, None, connect, zenoh)
+        service = options.service_address(config, None, None, connect, zenoh)
         _require_extra()
         return _show_vehicle(config, pair, service, timeout_s, address, as_json=as_json)
     if pair is not None or connect is not None or zenoh is not None:
@@ -117,7 +111,13 @@ def _require_extra() -> None:
 
 
 def _show_vehicle(
-    file: Path, name: str | None, service: ServiceAddress, timeout_s: float, address: ListenAddress, *, as_json: bool
+    file: Path,
+    name: str | None,
+    service: options.ServiceAddress,
+    timeout_s: float,
+    address: ListenAddress,
+    *,
+    as_json: bool,
 ) -> int:
     """Serves what the sensors and the service of a running vehicle send, until a signal.
 
@@ -127,19 +127,18 @@ def _show_vehicle(
         ConnectionFailedError: no router answered.
         UnavailableError: the address cannot be listened on.
     """
-    from coec.cli.view.vehicle import VehiclePair, show_live
+    from coec.cli.view.sources import VehiclePair, show_live
     from coec.config import load_config
     from coec.io.rig_files import rig_of
     from coec.io.zenoh.query_client import connected_by
-    from coec.schemas.keys import Keys
     from coec.service.discovery import with_discovered
 
     config = with_discovered(load_config(file))
-    pair, limits = pair_named(config, name), config.limits
+    pair, limits = options.pair_named(config, name), config.limits
     rig = rig_of(pair)
     vehicle = VehiclePair(Keys(service.prefix, service.vehicle), pair, rig, config)
     connection = connected_by(service.way, timeout_s, limits.max_message_bytes)
-    with until_signal() as stop, connection as session:
+    with options.until_signal() as stop, connection as session:
         screen = _screen(address, rig)
         try:
             _announce(screen, rig, f"{service.vehicle}/{pair.name}", as_json=as_json)
@@ -158,16 +157,15 @@ def _show_recording(
         UsageError, SourceError, WindowError: no such recording or result, or the library is missing.
         UnavailableError: the address cannot be listened on.
     """
-    from coec.cli.view.recording import Playback, load_candidate, show_recording
+    from coec.cli.view.sources import Playback, load_candidate, show_recording
     from coec.io.recordings.layouts import open_source
-    from coec.reports import console
 
     recording = open_source(source)
     candidate = None if result is None else load_candidate(result)
     if candidate is not None and candidate.result.pair != recording.rig.pair:
         console.say(f"coec: the result is of pair {candidate.result.pair}, the recording of {recording.rig.pair}")
     refused: Counter[str] = Counter()
-    with until_signal() as stop:
+    with options.until_signal() as stop:
         screen = _screen(address, recording.rig)
         try:
             _announce(screen, recording.rig, recording.name, as_json=as_json)
@@ -189,7 +187,6 @@ def _screen(address: ListenAddress, rig: Rig) -> ViewerServer:
 def _announce(screen: ViewerServer, rig: Rig, shown: str, *, as_json: bool) -> None:
     """Prints where viewers are served, and what."""
     from coec.io.viewer_scene import DisplayedPose, frame_of, topics_for
-    from coec.reports import console
 
     if as_json:
         frames = {pose.value: frame_of(rig.camera_frame, pose) for pose in DisplayedPose}

@@ -12,17 +12,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from coec.cli.options import (
-    Connect,
-    Prefix,
-    RouterTimeout,
-    ServiceAddress,
-    ServiceConfig,
-    SessionFile,
-    service_address,
-    until_signal,
-)
+from coec.cli import options
 from coec.errors import UsageError
+from coec.reports import console
+from coec.reports.formatting import count, second
+from coec.schemas.keys import Keys
 
 if TYPE_CHECKING:
     import zenoh
@@ -39,13 +33,13 @@ POLL_S = 0.2
 
 
 def watch(
-    config: ServiceConfig = None,
+    config: options.ServiceConfig = None,
     vehicle: Annotated[
         str | None, typer.Option(help="Show only this vehicle.", show_default="all of them; `vehicle` for lines")
     ] = None,
-    prefix: Prefix = None,
-    connect: Connect = None,
-    zenoh: SessionFile = None,
+    prefix: options.Prefix = None,
+    connect: options.Connect = None,
+    zenoh: options.SessionFile = None,
     states: Annotated[
         list[str] | None,
         typer.Option("--state", help="Only pairs in this state, or `parked`, `silent`; repeatable.", metavar="STATE"),
@@ -64,7 +58,7 @@ def watch(
             help="Print lines for this many seconds: exit 1 if nothing was received.", min=0.1, show_default="for ever"
         ),
     ] = None,
-    timeout_s: RouterTimeout = 5.0,
+    timeout_s: options.RouterTimeout = 5.0,
     as_json: Annotated[
         bool,
         typer.Option("--json", help="Print one JSON document per line on standard output; with --once, one document."),
@@ -83,9 +77,9 @@ def watch(
         raise UsageError("--once, --state and --find are about the board, --lines and --seconds about lines")
     on_screen = sys.stdout.isatty() and not as_json
     if of_lines or not (of_board or on_screen):
-        address = service_address(config, vehicle, prefix, connect, zenoh)
+        address = options.service_address(config, vehicle, prefix, connect, zenoh)
         return _print_changes(address, seconds, timeout_s, as_json=as_json)
-    address = service_address(
+    address = options.service_address(
         config, EVERY_VEHICLE if vehicle is None and config is None else vehicle, prefix, connect, zenoh
     )
     if not (once or on_screen):
@@ -93,7 +87,7 @@ def watch(
     return show_fleet(address, states or (), find or "", timeout_s, once=once, as_json=as_json)
 
 
-def _print_changes(address: ServiceAddress, seconds: float | None, timeout_s: float, *, as_json: bool) -> int:
+def _print_changes(address: options.ServiceAddress, seconds: float | None, timeout_s: float, *, as_json: bool) -> int:
     """Writes a line per change until a signal, or for some seconds; returns 1 if nothing was received.
 
     Raises:
@@ -103,7 +97,7 @@ def _print_changes(address: ServiceAddress, seconds: float | None, timeout_s: fl
 
     received = 0
     connection = connected_by(address.way, timeout_s)
-    with until_signal() as stop, connection as session, _changes(session, address, timeout_s) as changes:
+    with options.until_signal() as stop, connection as session, _changes(session, address, timeout_s) as changes:
         end_s = None if seconds is None else time.monotonic() + seconds
         while not stop.is_set():
             try:
@@ -118,12 +112,11 @@ def _print_changes(address: ServiceAddress, seconds: float | None, timeout_s: fl
 
 
 @contextmanager
-def _changes(session: zenoh.Session, address: ServiceAddress, timeout_s: float) -> Iterator[queue.Queue[PairUpdate]]:
+def _changes(
+    session: zenoh.Session, address: options.ServiceAddress, timeout_s: float
+) -> Iterator[queue.Queue[PairUpdate]]:
     """The present state, and every change from then on."""
     from coec.io.zenoh.subscriptions import subscribed
-    from coec.reports import console
-    from coec.reports.formatting import count
-    from coec.schemas.keys import Keys
 
     waiting: queue.Queue[PairUpdate] = queue.Queue(WAITING)
     lost = Counter[str]()
@@ -146,8 +139,6 @@ def _changes(session: zenoh.Session, address: ServiceAddress, timeout_s: float) 
 
 def _write(change: PairUpdate, vehicle: str, *, as_json: bool) -> None:
     """Prints a change: for people with the time, and with its vehicle."""
-    from coec.reports import console
-    from coec.reports.formatting import second
     from coec.schemas.replies import HealthReply
     from coec.service.worker import compilation
 

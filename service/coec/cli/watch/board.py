@@ -20,7 +20,7 @@ from coec.io.zenoh.query_client import connected_by, query_one
 from coec.io.zenoh.subscriptions import HeartbeatReceiver
 from coec.reports import console, fleet_board
 from coec.reports.replies import results_table
-from coec.schemas.fleet import FleetNow, PairNow
+from coec.schemas.documents import FleetNow, PairNow
 from coec.schemas.keys import Keys
 from coec.schemas.message import from_msgpack
 from coec.schemas.replies import HistoryReply

@@ -145,7 +145,11 @@ def read_records(stream: BinaryIO, *, max_unpacked_bytes: int | None = None) -> 
             expected = _Cursor(body, body_at).unpack(struct.Struct("<I"))[0]
             if expected not in (0, crc):
                 raise McapDamagedError(f"byte {at}: the CRC of the data section does not agree")
-            _check_summary(stream, body_at + length, size)
+            # What follows is a summary that begins right here (or none), a footer, and nothing else.
+            data_end, (_, summary_at) = body_at + length, _summary(stream, size)
+            if summary_at != data_end:
+                beyond = f"{summary_at - data_end} bytes between the data and the summary belong to neither"
+                raise McapDamagedError(f"byte {data_end}: {beyond}")
             return
         crc = zlib.crc32(body, zlib.crc32(prefix, crc))
         if opcode == Opcode.CHUNK:
@@ -248,13 +252,6 @@ def _summary(stream: BinaryIO, size: int) -> tuple[bytes, int]:
     if expected not in (0, zlib.crc32(tail[: _PREFIX.size + _FOOTER.size - 4], zlib.crc32(summary))):
         raise McapDamagedError(f"byte {summary_at}: the CRC of the summary does not agree")
     return summary, summary_at
-
-
-def _check_summary(stream: BinaryIO, at: int, size: int) -> None:
-    """Checks what follows the data section: a summary that begins right here (or none), a footer, and nothing else."""
-    _, summary_at = _summary(stream, size)
-    if summary_at != at:
-        raise McapDamagedError(f"byte {at}: {summary_at - at} bytes between the data and the summary belong to neither")
 
 
 # --- records ------------------------------------------------------------------------------------------------

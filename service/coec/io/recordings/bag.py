@@ -11,15 +11,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from coec.calibration.frames.lidar_origin import NO_SCAN_LINES, ApparentOrigin, SeveralOrigins, from_origin
-from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4, Recognition, Rig
+from coec.calibration.types import CameraFrame, EgoMotion, Frame, FramePair, LidarFrame, Matrix4, Recognition, Rig
 from coec.config import CalibrationConfig
 from coec.errors import DecodeError, SourceError, UsageError
-from coec.io.mcap.window_reader import is_window, read_window
+from coec.io.mcap.windows import is_window, read_window
 from coec.io.recordings import bag_index, bag_recognition, recording_source
-from coec.io.recordings.bag_folder import open_storage
-from coec.io.recordings.bag_recognition import Sweep
-from coec.io.recordings.bag_rig import PairMessages, lidar_frame_of, rig_of_bag
-from coec.io.recordings.bag_storage import BagReader, BagStorage
+from coec.io.recordings.bag_recognition import PairMessages, Sweep, lidar_frame_of, rig_of_bag
+from coec.io.recordings.bag_storage import BagReader, BagStorage, open_storage
 from coec.io.recordings.cloud_files import measured_from
 from coec.io.recordings.recording_source import evenly_spread
 from coec.io.ros import messages
@@ -224,7 +222,7 @@ class BagRecording:
         """See `Recording`."""
         return tuple(motion.stamp_ns for motion in self.streams.motions)
 
-    def messages(self, cameras: Collection[int] | None = None) -> Iterator[recording_source.SensorMessage]:
+    def messages(self, cameras: Collection[int] | None = None) -> Iterator[Frame]:
         """See `Recording.messages`. With chosen camera frames, only the sweep nearest to each of them comes."""
         selected = [
             self.streams.camera[index] for index in recording_source.selected_indices(cameras, len(self.streams.camera))
@@ -266,7 +264,8 @@ class BagRecording:
             def load(place: bag_index.MessageLocation) -> LidarFrame:
                 return self._cloud(reader, place)
 
-            sweeps, of_clouds = bag_recognition.sweeps_of_clouds(self._clouds(), load, readings.clouds)
+            clouds = [cloud for sweep in self.streams.lidar for cloud in sweep.clouds]
+            sweeps, of_clouds = bag_recognition.sweeps_of_clouds(clouds, load, readings.clouds)
             streams = _shifted(replace(self.streams, lidar=sweeps), readings)
             recording = replace(self, streams=streams, recognitions=(*self.recognitions, *of_clouds))
             if readings.rings is None and recording._is_unordered(reader):
@@ -277,9 +276,6 @@ class BagRecording:
                 instant, of_points = recording._compensated(reader)
         recognitions = (*recording.recognitions, *(() if of_points is None else (of_points,)))
         return replace(recording, recognitions=recognitions, compensated=instant or None)
-
-    def _clouds(self) -> list[bag_index.MessageLocation]:
-        return [cloud for sweep in self.streams.lidar for cloud in sweep.clouds]
 
     def _is_unordered(self, reader: BagReader) -> bool:
         """Whether ring numbers are no scan lines, by two sweeps: to look for the cones of each takes time."""
@@ -385,7 +381,7 @@ def _frames(text: str | None) -> tuple[str, str]:
 
 def _load(
     storage: BagStorage, reader: BagReader, place: bag_index.MessageLocation, clouds: bag_index.CloudDecoder
-) -> recording_source.SensorMessage:
+) -> Frame:
     data = reader.read(place.at)
     try:
         return clouds.decode(place.type_name, data)

@@ -19,19 +19,12 @@ from typing import Final, TypeVar
 import numpy as np
 from pydantic import ValidationError
 
-from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Recognition
+from coec.calibration.types import EgoMotion, Frame, Matrix4, Recognition
 from coec.config import LimitsConfig, PointTimeConfig, describe
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.io.recordings.bag_storage import MAX_MESSAGE_BYTES, BagMessage, BagReader, BagStorage
-from coec.io.ros import camera_info, livox, message_decoding, messages
-from coec.io.ros.transforms import (
-    MovingFrame,
-    StaticTransform,
-    StaticTransforms,
-    bare,
-    decode_static_transforms,
-    frames_in,
-)
+from coec.io.ros import camera_info, message_decoding, messages, point_clouds
+from coec.io.ros import transforms as ros_transforms
 from coec.schemas.keys import TF_STATIC
 
 LIMITS: Final = LimitsConfig(max_message_bytes=MAX_MESSAGE_BYTES)
@@ -68,7 +61,7 @@ class CloudDecoder:
         except ValueError:
             raise UsageError(f"lidar_source={source}: it is a whole number, as in the points' field") from None
 
-    def decode(self, type_name: str, data: bytes) -> CameraFrame | LidarFrame | EgoMotion:
+    def decode(self, type_name: str, data: bytes) -> Frame:
         """The frame in a message of this type.
 
         Raises:
@@ -78,7 +71,7 @@ class CloudDecoder:
 
 
 IMAGE_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE)
-CLOUD_TYPES = (messages.POINT_CLOUD, *livox.TYPES)
+CLOUD_TYPES = (messages.POINT_CLOUD, *point_clouds.TYPES)
 VELOCITY_TYPES = (messages.ODOMETRY, messages.TWIST, messages.TWIST_WITH_COVARIANCE)
 ROTATION_TYPES = (messages.IMU,)
 
@@ -119,7 +112,7 @@ class TopicStream:
     @property
     def frames(self) -> Counter[str]:
         """How many messages name each frame."""
-        return Counter(bare(location.frame_id) for location in self.locations)
+        return Counter(ros_transforms.bare(location.frame_id) for location in self.locations)
 
 
 @dataclass(slots=True)
@@ -139,7 +132,7 @@ class BagIndex:
     clouds: CloudDecoder
     streams: dict[str, TopicStream] = field(default_factory=dict)
     infos: dict[str, camera_info.CameraInfos] = field(default_factory=dict)
-    transforms: StaticTransforms = field(default_factory=StaticTransforms)
+    transforms: ros_transforms.StaticTransforms = field(default_factory=ros_transforms.StaticTransforms)
     transforms_at: dict[str, list[tuple[int, ...]]] = field(default_factory=dict)
     unread: dict[str, str] = field(default_factory=dict)
 
@@ -155,7 +148,7 @@ class BagIndex:
                 f"; {other} has {type_name}: {message_decoding.REFUSED[type_name]}"
                 for other, type_name in self.unread.items()
             )
-            named = " or ".join(name for name in types if name not in livox.TYPES)
+            named = " or ".join(name for name in types if name not in point_clouds.TYPES)
             raise SourceError(f"{self.path} has no message of type {named}{advice}")
         return topic
 
@@ -182,7 +175,7 @@ class BagIndex:
         Raises:
             SourceError: they connect the frames in ways that contradict each other.
         """
-        if bare(target) == bare(source):
+        if ros_transforms.bare(target) == ros_transforms.bare(source):
             return np.eye(4)
         doubts = self.transforms.doubts(target, source)
         if doubts:
@@ -199,13 +192,17 @@ class BagIndex:
         frames = stream.frames
         if len(frames) < 2:
             return
-        if requested is None or bare(requested) not in frames:
+        if requested is None or ros_transforms.bare(requested) not in frames:
             counts = ", ".join(f"{frame!a} ({count})" for frame, count in frames.most_common(LISTED))
             raise SourceError(
                 f"{self.path}: the messages on {topic} name {len(frames)} frames: {counts}. Two sensors publish on it: "
                 f"choose one with ?{key}=NAME"
             )
-        stream.locations = [location for location in stream.locations if bare(location.frame_id) == bare(requested)]
+        stream.locations = [
+            location
+            for location in stream.locations
+            if ros_transforms.bare(location.frame_id) == ros_transforms.bare(requested)
+        ]
 
     def connect(self, target: str, source: str, reader: BagReader) -> tuple[Recognition, ...]:
         """If the static transforms do not connect two frames, adds those of other topics (`/tf`) that never change,
@@ -220,11 +217,11 @@ class BagIndex:
         return (Recognition("constant_transforms", text, "warn"),)
 
     def _add_constant_transforms(self, reader: BagReader) -> None:
-        constant: dict[tuple[str, str], StaticTransform | None] = {}
+        constant: dict[tuple[str, str], ros_transforms.StaticTransform | None] = {}
         for topic in self.transforms_at:
             for place in self.transforms_at[topic][:MAX_TF_MESSAGES]:
                 try:
-                    joints = decode_static_transforms(reader.read(place)).joints
+                    joints = ros_transforms.decode_static_transforms(reader.read(place)).joints
                 except DecodeError:
                     continue
                 for joint in joints:
@@ -255,7 +252,7 @@ class BagIndex:
         elif name == messages.CAMERA_INFO:
             self._decoded(entry, self.infos.setdefault(entry.topic, camera_info.CameraInfos()).add)
         elif name == messages.TF and entry.topic == TF_STATIC:
-            decoded = self._decoded(entry, decode_static_transforms)
+            decoded = self._decoded(entry, ros_transforms.decode_static_transforms)
             self.transforms.refuse(decoded.refused)
             self._decoded(entry, lambda _: self.transforms.add(decoded.joints))
         elif name in message_decoding.REFUSED and name != messages.TF:
@@ -347,7 +344,7 @@ def motions_of_transforms(
 
 
 def _motions(index: BagIndex, reader: BagReader, topic: str, frames: tuple[str, str]) -> list[EgoMotion]:
-    moving = MovingFrame(*frames)
+    moving = ros_transforms.MovingFrame(*frames)
     try:
         motions = [moving.motion(data) for data in _messages(index, reader, topic)]
     except DecodeError as error:
@@ -356,7 +353,7 @@ def _motions(index: BagIndex, reader: BagReader, topic: str, frames: tuple[str, 
 
 
 def _joints(index: BagIndex, reader: BagReader, topic: str) -> set[tuple[str, str]]:
-    return {joint for data in _messages(index, reader, topic) for joint in frames_in(data)}
+    return {joint for data in _messages(index, reader, topic) for joint in ros_transforms.frames_in(data)}
 
 
 def _messages(index: BagIndex, reader: BagReader, topic: str) -> Iterable[bytes]:

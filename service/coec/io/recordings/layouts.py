@@ -10,9 +10,8 @@ import numpy as np
 from coec.calibration.rig.lidar_sampling import LidarRig, SweepPair
 from coec.calibration.types import EgoMotion, LidarFrame, Matrix4
 from coec.errors import DecodeError, SourceError, UsageError
-from coec.io.recordings.bag_folder import open_storage
 from coec.io.recordings.bag_index import CLOUD_TYPES, VELOCITY_TYPES, CloudDecoder, MessageLocation, build_index
-from coec.io.recordings.bag_storage import BagStorage
+from coec.io.recordings.bag_storage import BagStorage, open_storage
 from coec.io.recordings.recording_source import (
     FORMS,
     MOTION_REACH_NS,
@@ -40,7 +39,7 @@ def open_source(spec: str) -> RecordingSource:
     # Each layout is imported when it is asked for, because not all need OpenCV, rosbags and the MCAP readers.
     match parsed.layout:
         case "kitti360":
-            from coec.io.recordings.kitti360 import open_kitti360
+            from coec.io.recordings.kitti import open_kitti360
 
             return open_kitti360(parsed)
         case "kitti-raw":
@@ -48,7 +47,7 @@ def open_source(spec: str) -> RecordingSource:
 
             return open_kitti_raw(parsed)
         case "kitti-odometry":
-            from coec.io.recordings.kitti_odometry import open_kitti_odometry
+            from coec.io.recordings.kitti import open_kitti_odometry
 
             return open_kitti_odometry(parsed)
         case "sim":
@@ -64,7 +63,7 @@ def _open_path(spec: SourceSpec) -> RecordingSource:
         from coec.io.recordings.bag import open_bag
 
         return open_bag(spec)
-    from coec.io.recordings.kitti_odometry import is_kitti_odometry, open_kitti_odometry
+    from coec.io.recordings.kitti import is_kitti_odometry, open_kitti_odometry
 
     if is_kitti_odometry(spec.path) and not (spec.path / "dataset.yaml").is_file():
         return open_kitti_odometry(spec)

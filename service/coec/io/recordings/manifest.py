@@ -1,4 +1,5 @@
-"""`dataset.yaml`: images and clouds listed one by one (CONTRACT, "Command line").
+"""`dataset.yaml`: images and clouds listed one by one (CONTRACT, "Command line"); and the same file without a mistake
+that was found in it.
 
 The coordinate frames are called `camera` and `lidar`. A `twist` is the velocity of the LiDAR in its own frame at the
 stamp of the image.
@@ -6,7 +7,8 @@ stamp of the image.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -16,18 +18,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+from ruamel.yaml.nodes import CollectionNode, MappingNode, Node
 
+from coec.calibration import types
 from coec.calibration.frames.lidar_origin import ApparentOrigin, SeveralOrigins
-from coec.calibration.types import (
-    CameraFrame,
-    CloudFrame,
-    EgoMotion,
-    EncodedImage,
-    ImageFormat,
-    LidarFrame,
-    Matrix4,
-    Rig,
-)
+from coec.calibration.search.mistakes import INVERSE_POSE
 from coec.config import (
     IDENTITY,
     CameraIntrinsics,
@@ -36,16 +33,19 @@ from coec.config import (
     Name,
     PointTimeConfig,
     describe,
+    load_yaml,
 )
-from coec.config.pose_forms import Pose, with_direction
-from coec.errors import ConfigError, DecodeError, SourceError
+from coec.config.pair import Pose, with_direction
+from coec.errors import ConfigError, DecodeError, OutputError, SourceError, UsageError
+from coec.geometry import cameras, se3
+from coec.geometry.cameras import Camera
 from coec.io.images import encode_depth_png, probe, raw_image
 from coec.io.intrinsics_files import cameras_of, load_camera_document, with_camera
 from coec.io.recordings.cloud_files import MAX_COLUMNS, CloudLayout, load_cloud, measured_from
 from coec.io.recordings.kitti import load_image
-from coec.io.recordings.recording_source import FramewiseRecording, RecordedFrame, SourceSpec
+from coec.io.recordings.recording_source import FramewiseRecording, RecordedFrame, SourceSpec, is_bag, parse_spec
 from coec.io.rig_files import camera_of, load_mask
-from coec.io.user_files import read_bytes, read_npy
+from coec.io.user_files import read_bytes, read_npy, write_output
 
 FILE_NAME = "dataset.yaml"
 CAMERA_FRAME = "camera"
@@ -146,7 +146,7 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
         raise SourceError(f"{path}: {describe(error)}") from error
     except ConfigError as error:
         raise SourceError(f"{path}: {error}") from error
-    rig = Rig(
+    rig = types.Rig(
         pair=document.pair,
         camera=camera,
         camera_frame=CAMERA_FRAME,
@@ -154,7 +154,7 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
         T_camera_lidar_nominal=T_camera_lidar,
         T_lidar_ego=np.eye(4),
         mask=mask,
-        cloud=None if np.array_equal(T_cloud_lidar, np.eye(4)) else CloudFrame(CLOUD_FRAME, T_cloud_lidar),
+        cloud=None if np.array_equal(T_cloud_lidar, np.eye(4)) else types.CloudFrame(CLOUD_FRAME, T_cloud_lidar),
     )
     frames = sorted(document.frames, key=lambda frame: frame.stamp_ns)
     _check_frames(path, frames)
@@ -162,7 +162,7 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
     scale = _DepthScale([depth for depth in depths if depth.suffix == ".npy"])
     layout = CloudLayout(document.cloud_columns, document.cloud_time)
     motions = [
-        EgoMotion(frame.stamp_ns, LIDAR_FRAME, frame.twist.linear_mps, frame.twist.angular_radps)
+        types.EgoMotion(frame.stamp_ns, LIDAR_FRAME, frame.twist.linear_mps, frame.twist.angular_radps)
         for frame in frames
         if frame.twist is not None
     ]
@@ -217,7 +217,7 @@ def _cloud_stamp_ns(frame: FrameDocument) -> int:
 
 
 def _recorded(
-    folder: Path, frame: FrameDocument, scale: _DepthScale, T_cloud_lidar: Matrix4, layout: CloudLayout
+    folder: Path, frame: FrameDocument, scale: _DepthScale, T_cloud_lidar: types.Matrix4, layout: CloudLayout
 ) -> RecordedFrame:
     cloud_stamp_ns = _cloud_stamp_ns(frame)
     return RecordedFrame(
@@ -234,19 +234,19 @@ _ADVICE = {
 }
 
 
-def _load_lidar(path: Path, stamp_ns: int, T_cloud_lidar: Matrix4, layout: CloudLayout) -> LidarFrame:
+def _load_lidar(path: Path, stamp_ns: int, T_cloud_lidar: types.Matrix4, layout: CloudLayout) -> types.LidarFrame:
     return measured_from(load_cloud(stamp_ns, LIDAR_FRAME, path, layout), T_cloud_lidar, LIDAR_FRAME, path, _ADVICE)
 
 
-def _load_camera(folder: Path, frame: FrameDocument, scale: _DepthScale) -> CameraFrame:
+def _load_camera(folder: Path, frame: FrameDocument, scale: _DepthScale) -> types.CameraFrame:
     depth = None
     if frame.depth is not None:
         file = folder / frame.depth
         depth = scale.encode(file) if file.suffix == ".npy" else load_image(file)
-    return CameraFrame(frame.stamp_ns, CAMERA_FRAME, _load_any_image(folder / frame.image), depth=depth)
+    return types.CameraFrame(frame.stamp_ns, CAMERA_FRAME, _load_any_image(folder / frame.image), depth=depth)
 
 
-def _load_any_image(path: Path) -> EncodedImage:
+def _load_any_image(path: Path) -> types.EncodedImage:
     """JPEG and PNG files as they are; any other image that OpenCV can read as raw 8-bit pixels."""
     data = read_bytes(path)
     try:
@@ -261,7 +261,7 @@ def _load_any_image(path: Path) -> EncodedImage:
     if pixels is None:
         raise SourceError(f"{path} is not an image that OpenCV reads")
     height, width = pixels.shape[:2]
-    return raw_image(ImageFormat.BGR8, width, height, pixels.tobytes(), LimitsConfig())
+    return raw_image(types.ImageFormat.BGR8, width, height, pixels.tobytes(), LimitsConfig())
 
 
 class _DepthScale:
@@ -281,7 +281,7 @@ class _DepthScale:
             self._least = min(least for least, _ in extremes)
             self._span = max(greatest for _, greatest in extremes) - self._least
 
-    def encode(self, path: Path) -> EncodedImage:
+    def encode(self, path: Path) -> types.EncodedImage:
         """The map as a 16-bit grey PNG.
 
         Raises:
@@ -304,3 +304,137 @@ def _load_float_map(path: Path) -> NDArray[np.floating]:
     if values.size > LimitsConfig().max_image_pixels:
         raise SourceError(f"{path}: {values.shape} is larger than any depth map")
     return np.asarray(values, dtype=np.float64)
+
+
+DIGITS = 9
+"""Decimal places of a matrix, as `coec calibrate` prints one."""
+
+OTHER_DIRECTION = {"T_camera_lidar": "T_lidar_camera", "T_lidar_camera": "T_camera_lidar"}
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """A corrected manifest, and what was changed in it, one sentence each."""
+
+    path: Path
+    changes: tuple[str, ...]
+
+
+def manifest_of(source: str) -> Path:
+    """The manifest that a SOURCE argument names.
+
+    Raises:
+        UsageError: it names no manifest, so that nothing can be corrected.
+    """
+    if not has_manifest(source):
+        raise UsageError(f"--fix writes a corrected {FILE_NAME}, and {source} has none")
+    path = parse_spec(source).path
+    return path / FILE_NAME if path.is_dir() else path
+
+
+def has_manifest(source: str) -> bool:
+    """Whether a SOURCE argument names a manifest, or a folder with one."""
+    spec = parse_spec(source)
+    is_manifest = spec.path.suffix in (".yaml", ".yml") or (spec.path / FILE_NAME).is_file()
+    return spec.layout is None and not is_bag(spec) and is_manifest
+
+
+def write_corrected(path: Path, mistake: types.Mistake, camera: Camera, T_camera_lidar: types.Matrix4) -> Correction:
+    """Writes `NAME.fixed.yaml` next to a manifest. `camera` and `T_camera_lidar` (4, 4) are what the manifest gives.
+
+    Raises:
+        OutputError: no entry of the manifest corrects the mistake, or another file of that name exists.
+        SourceError: the manifest cannot be read.
+    """
+    if not mistake.correctable:
+        raise OutputError(f"no entry of {path} corrects this: {mistake.text}")
+    text = _text(path)
+    edits: list[tuple[int, int, str]] = []
+    changes: list[str] = []
+    root = _root(text, path)
+    for key, value in root.value:
+        name = key.value
+        if name in (*OTHER_DIRECTION, "T_camera_cloud") and not np.array_equal(mistake.T_camera_lidar, T_camera_lidar):
+            edit, change = _pose_edit(key, value, mistake)
+        elif name == "camera" and mistake.camera != camera:
+            edit, change = _camera_edits(value, camera, mistake.camera)
+        else:
+            continue
+        edits += edit
+        changes.append(change)
+    for begin, end, replacement in sorted(edits, reverse=True):
+        text = text[:begin] + replacement + text[end:]
+    corrected = path.with_name(f"{path.stem}.fixed{path.suffix}")
+    if corrected.exists() and _text(corrected) != text:
+        raise OutputError(f"{corrected} exists and is another: move it away first")
+    write_output(corrected, text.encode())
+    try:
+        load_yaml(corrected)
+    except ConfigError as error:
+        corrected.unlink()
+        raise OutputError(f"{path} cannot be corrected without changing its form: {error}") from error
+    return Correction(corrected, tuple(changes))
+
+
+def _text(path: Path) -> str:
+    try:
+        return read_bytes(path).decode()
+    except UnicodeDecodeError as error:
+        raise SourceError(f"{path} is not UTF-8 text") from error
+
+
+def _root(text: str, path: Path) -> MappingNode:
+    try:
+        root: Any = YAML().compose(text)
+    except YAMLError as error:
+        raise SourceError(f"{path} is not valid YAML: {str(error).splitlines()[0]}") from error
+    if not isinstance(root, MappingNode):
+        raise SourceError(f"{path} holds no map of names")
+    return root
+
+
+def _pose_edit(key: Node, value: Node, mistake: types.Mistake) -> tuple[list[tuple[int, int, str]], str]:
+    name = key.value
+    if mistake.code == INVERSE_POSE and name in OTHER_DIRECTION:
+        other = OTHER_DIRECTION[name]
+        return [(key.start_mark.index, key.end_mark.index, other)], f"{name} is called {other}, with the same numbers"
+    rows = [", ".join(f"{number + 0.0:.{DIGITS}f}" for number in row) for row in _orthonormal(mistake.T_camera_lidar)]
+    lines = "".join(f"\n  - [{row}]" for row in rows)
+    return [(key.start_mark.index, _end(value), f"T_camera_lidar:{lines}")], f"{name} is replaced by another pose"
+
+
+def _orthonormal(T: types.Matrix4) -> types.Matrix4:
+    """The pose with a rotation that is exact to rounding."""
+    unit = se3.rotation_from_quaternion_xyzw(se3.quaternion_xyzw_from_rotation(T[:3, :3]))
+    return se3.transform_from(unit, T[:3, 3])
+
+
+def _camera_edits(value: Node, given: Camera, right: Camera) -> tuple[list[tuple[int, int, str]], str]:
+    model = cameras.name_of(right)
+    before, after = cameras.intrinsics_of(given), cameras.intrinsics_of(right)
+    changed = {name: number for name, number in after.items() if before.get(name) != number}
+    if isinstance(value, MappingNode) and model == cameras.name_of(given):
+        places = {key.value: number for key, number in value.value}
+        if changed.keys() <= places.keys():
+            edits = [(places[n].start_mark.index, places[n].end_mark.index, _number(v)) for n, v in changed.items()]
+            return edits, f"camera: {', '.join(f'{name} = {_number(number)}' for name, number in changed.items())}"
+    entries = ", ".join(f"{name}: {_number(number)}" for name, number in after.items())
+    # A map in block style begins on the next line.
+    flow = f"{{model: {model}, {entries}}}"
+    return [(value.start_mark.index, _end(value), flow)], f"camera: {flow}"
+
+
+def _number(number: float) -> str:
+    return str(number) if isinstance(number, int) else f"{number:.10g}"
+
+
+def _end(node: Node) -> int:
+    """The place behind a node. The end mark of a block lies behind the comments that follow it."""
+    if isinstance(node, CollectionNode) and not node.flow_style and node.value:
+        return max(_end(leaf) for leaf in _leaves(node))
+    return int(node.end_mark.index)
+
+
+def _leaves(node: CollectionNode) -> Iterator[Node]:
+    for item in node.value:
+        yield from item if isinstance(item, tuple) else (item,)

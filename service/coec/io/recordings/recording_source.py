@@ -11,13 +11,11 @@ from urllib.parse import parse_qsl
 
 import numpy as np
 
-from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Recognition, Rig
+from coec.calibration.types import CameraFrame, EgoMotion, Frame, LidarFrame, Matrix4, Recognition, Rig
 from coec.config import CalibrationConfig
 from coec.errors import UsageError
 from coec.extensions import SOURCES, added_by_packages
 from coec.io.user_files import expand_home
-
-SensorMessage = CameraFrame | LidarFrame | EgoMotion
 
 MOTION_REACH_NS = 1_000_000_000
 """Ego-motion within this time of a chosen camera frame is handed out with it, ns: five times the default motion
@@ -65,7 +63,7 @@ class RecordingSource(Protocol):
         """Stamps of the ego-motion, ascending, nanoseconds; empty if there is none."""
         ...
 
-    def messages(self, cameras: Collection[int] | None = None) -> Iterator[SensorMessage]:
+    def messages(self, cameras: Collection[int] | None = None) -> Iterator[Frame]:
         """Messages in ascending order of their stamps, each loaded when it is its turn.
 
         Args:
@@ -147,12 +145,12 @@ class FramewiseRecording:
         """See `Recording`."""
         return tuple(motion.stamp_ns for motion in self.motions)
 
-    def messages(self, cameras: Collection[int] | None = None) -> Iterator[SensorMessage]:
+    def messages(self, cameras: Collection[int] | None = None) -> Iterator[Frame]:
         """See `Recording.messages`."""
         frames = [self.frames[index] for index in selected_indices(cameras, len(self.frames))]
         stamps_ns = [frame.camera_stamp_ns for frame in frames]
         motions = self.motions if cameras is None else motions_near(self.motions, stamps_ns)
-        queue: list[tuple[int, int, int, Callable[[], SensorMessage]]] = []
+        queue: list[tuple[int, int, int, Callable[[], Frame]]] = []
         for place, frame in enumerate(frames):
             queue.append((frame.lidar_stamp_ns, _LIDAR, place, frame.load_lidar))
             queue.append((frame.camera_stamp_ns, _CAMERA, place, frame.load_camera))

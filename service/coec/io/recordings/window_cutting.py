@@ -19,7 +19,7 @@ from coec.errors import SourceError, UsageError
 from coec.geometry import se3
 from coec.geometry.projection import half_field_of_view_rad
 from coec.io.images import CompressingReducer
-from coec.io.mcap.window_reader import is_window, read_result, read_window
+from coec.io.mcap.windows import is_window, read_result, read_window
 from coec.io.recordings.layouts import RecordingSource, open_source
 from coec.io.recordings.recording_source import evenly_spread, parse_spec, recognitions_of
 

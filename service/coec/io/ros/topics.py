@@ -15,7 +15,7 @@ import numpy as np
 from rosbags.typesys.stores import ros2_humble as ros
 
 from coec.calibration.frames.pairing import azimuth_offsets_s
-from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Rig
+from coec.calibration.types import CameraFrame, EgoMotion, Frame, LidarFrame, Matrix4, Rig
 from coec.config import OpenPairConfig
 from coec.errors import DecodeError
 from coec.io.frame_validation import Refusal
@@ -25,9 +25,6 @@ from coec.io.ros.message_encoding import PlacedFrame
 from coec.io.ros.point_clouds import SINCE_S, UNTIL_S, row_step_of
 from coec.io.ros.wire_format import Qos
 from coec.schemas.keys import TF_STATIC
-
-Frame = CameraFrame | LidarFrame | EgoMotion
-
 
 LATCHED: Final = 100
 """Messages of `/tf_static` that are kept for late subscribers: as many as tf2's listeners ask for (tf2_ros/qos.hpp,

@@ -20,7 +20,7 @@ from rosbags.typesys.stores import ros2_humble as ros
 
 from coec.errors import DecodeError
 from coec.io.frame_validation import Refusal
-from coec.io.ros import livox, messages
+from coec.io.ros import messages, point_clouds
 
 MAX_JSON_BYTES: Final = 64 * 2**20
 """Largest message in JSON: an image of 32 MiB has 43 MiB in base64."""
@@ -64,18 +64,15 @@ def _from_ros_1(type_name: str) -> Callable[[bytes], bytes]:
     return convert
 
 
-def _ros_1() -> dict[tuple[str, str], Translation]:
-    return {("ros1", "livox_ros_driver/CustomMsg"): _LIVOX, ("ros1", "livox_ros_driver2/CustomMsg"): _LIVOX} | _own()
-
-
 _LIVOX: Final = Translation(
-    messages.POINT_CLOUD, lambda data: messages.serialized(livox.cloud_of_ros_1(data), messages.POINT_CLOUD)
+    messages.POINT_CLOUD, lambda data: messages.serialized(point_clouds.cloud_of_ros_1(data), messages.POINT_CLOUD)
 )
 
 
-def _own() -> dict[tuple[str, str], Translation]:
+def _ros_1() -> dict[tuple[str, str], Translation]:
     known = {name: name for name in messages.known_types() if "/msg/" in name} | {"tf/msg/tfMessage": messages.TF}
-    return {
+    livox = {("ros1", "livox_ros_driver/CustomMsg"): _LIVOX, ("ros1", "livox_ros_driver2/CustomMsg"): _LIVOX}
+    return livox | {
         ("ros1", name.replace("/msg/", "/")): Translation(of_ros_2, _from_ros_1(of_ros_2))
         for name, of_ros_2 in known.items()
     }

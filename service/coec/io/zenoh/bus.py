@@ -25,16 +25,7 @@ from coec.config import Config, LimitsConfig, StreamConfig, ZenohConfig
 from coec.errors import CoecError, UnavailableError, UsageError
 from coec.io.ros import wire_format
 from coec.io.system import ServiceThread
-from coec.io.zenoh.endpoints import without_secrets
-from coec.io.zenoh.session import (
-    check_certificates,
-    endpoints_of,
-    mode_of,
-    open_waiting,
-    settings_of,
-    settings_source,
-    to_second_session,
-)
+from coec.io.zenoh import session as zenoh_session
 from coec.schemas.message import to_json, to_msgpack
 from coec.schemas.replies import ErrorReply
 
@@ -177,15 +168,21 @@ def open_session(config: ZenohConfig, limits: LimitsConfig, *, again: bool = Fal
         UnavailableError: a port is taken, or an address is not there.
     """
     zenoh.init_log_from_env_or("error")
-    settings = settings_of(config, limits)
+    settings = zenoh_session.settings_of(config, limits)
     if again:
-        settings = to_second_session(settings)
-    check_certificates(settings, settings_source(config))
+        settings = zenoh_session.to_second_session(settings)
+    zenoh_session.check_certificates(settings, zenoh_session.settings_source(config))
     try:
-        return open_waiting(settings) if mode_of(settings) == "client" else zenoh.open(settings)
+        return (
+            zenoh_session.open_waiting(settings)
+            if zenoh_session.mode_of(settings) == "client"
+            else zenoh.open(settings)
+        )
     except zenoh.ZError as error:
-        text = without_secrets(str(error), endpoints_of(config))
-        raise UnavailableError(f"cannot open the Zenoh session ({settings_source(config)}): {text}") from None
+        text = zenoh_session.without_secrets(str(error), zenoh_session.endpoints_of(config))
+        raise UnavailableError(
+            f"cannot open the Zenoh session ({zenoh_session.settings_source(config)}): {text}"
+        ) from None
 
 
 def is_connected(session: zenoh.Session) -> bool:

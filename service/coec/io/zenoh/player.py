@@ -15,7 +15,7 @@ from typing import Final, Literal, Protocol, TypeVar
 import zenoh
 from pydantic import TypeAdapter, ValidationError
 
-from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame
+from coec.calibration.types import CameraFrame, EgoMotion, Frame, LidarFrame
 from coec.config import OpenPairConfig, TopicName
 from coec.errors import UsageError
 from coec.io import msgpack_frames
@@ -107,8 +107,6 @@ def repeated(
 
 
 CAMERA, LIDAR, EGO = "camera", "lidar", "ego"
-
-Frame = CameraFrame | LidarFrame | EgoMotion
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,7 +216,7 @@ class Player:
         numbered = replace(frame, sequence=self._sequence[stream])
         self._sequence[stream] += 1
         if self._encoding == "msgpack":
-            return _msgpack(numbered), zenoh.Encoding("application/msgpack")
+            return msgpack_frames.encode(numbered), zenoh.Encoding("application/msgpack")
         type_name, payload = _cdr(numbered)
         return payload, zenoh.Encoding(f"application/cdr;{type_name}")
 
@@ -237,16 +235,6 @@ def stream_of(frame: Frame) -> str:
 def shifted(frame: Frame, shift_ns: int) -> Frame:
     """The frame with `shift_ns` added to its stamp."""
     return replace(frame, stamp_ns=frame.stamp_ns + shift_ns)
-
-
-def _msgpack(frame: Frame) -> bytes:
-    match frame:
-        case CameraFrame():
-            return msgpack_frames.encode_camera(frame)
-        case LidarFrame():
-            return msgpack_frames.encode_lidar(frame)
-        case EgoMotion():
-            return msgpack_frames.encode_ego(frame)
 
 
 def _cdr(frame: Frame) -> tuple[str, bytes]:

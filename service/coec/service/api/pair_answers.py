@@ -27,18 +27,7 @@ from coec.schemas import replies
 from coec.schemas.commands import COMMAND_NAMES
 from coec.schemas.keys import Format
 from coec.schemas.replies import SnippetInfo, WindowInfo, WindowsReply
-from coec.service.api import problems
-from coec.service.api.reply_builders import (
-    SerializedReply,
-    StampedReply,
-    answer_of,
-    axes_of,
-    exported,
-    extrinsic_of,
-    health_of,
-    pair_status_of,
-    with_problems,
-)
+from coec.service.api import problems, reply_builders
 from coec.service.discovery import info_topic_of
 from coec.service.discovery_listener import NominalStatus
 from coec.service.engine.messages import PairSnapshot
@@ -83,7 +72,7 @@ class WindowsList:
         answer = listing.answers.get(form)
         if answer is None:
             reply = WindowsReply(vehicle=self._vehicle, pair=self._pair, windows=windows, snippets=snippets)
-            answer = listing.answers[form] = answer_of(reply, form)
+            answer = listing.answers[form] = reply_builders.answer_of(reply, form)
         return answer
 
 
@@ -191,8 +180,8 @@ class PairAnswers:
         self.extrinsic_reply: replies.ExtrinsicReply
         """What `extrinsic` serves."""
         self._known: PairSnapshot
-        self._health: StampedReply
-        self._snapshots: dict[str, SerializedReply] = {}
+        self._health: reply_builders.StampedReply
+        self._snapshots: dict[str, reply_builders.SerializedReply] = {}
         self._published: dict[str, object] = {}
         self._lock = threading.Lock()
         self._fault: Reason | None = None
@@ -207,7 +196,9 @@ class PairAnswers:
         """Serialises the answers anew, and publishes what has changed."""
         report, rig = self._stream.report, self.rig
         accepted = None if known.state.accepted is None else result_of(known.state.accepted, rig, self._vehicle)
-        extrinsic = extrinsic_of(self._vehicle, rig, known.state, accepted, self.percent_complete, self._config_hash)
+        extrinsic = reply_builders.extrinsic_of(
+            self._vehicle, rig, known.state, accepted, self.percent_complete, self._config_hash
+        )
         own = () if self._recorder.problem is None else (self._recorder.problem,)
         topics, arrivals = self._context.topics(), self._stream.arrivals()
         changed = self._context.nominal(self.name).changed
@@ -222,15 +213,18 @@ class PairAnswers:
             *self._context.vehicle_problems(),
         )
         missed = problems.missed_of(arrivals, self._pair, topics)
-        health = health_of(
+        health = reply_builders.health_of(
             known, report, self._stream.losses(), problems_of_pair, missed, self._pair, rig, self._vehicle
         )
         with self._lock:
             if self._fault is not None:
                 health = _failing(health, self._fault)
-            self._known, self._health = known, StampedReply(health, time.monotonic())
+            self._known, self._health = known, reply_builders.StampedReply(health, time.monotonic())
             self.extrinsic_reply = extrinsic
-            self._snapshots = {"extrinsic": SerializedReply.of(extrinsic), "health": SerializedReply.of(health)}
+            self._snapshots = {
+                "extrinsic": reply_builders.SerializedReply.of(extrinsic),
+                "health": reply_builders.SerializedReply.of(health),
+            }
         essences = {
             "extrinsic": extrinsic.model_copy(update={"percent_complete": 0.0}),
             "health": (health.state, tuple(map(_essence, health.reasons)), health.needs, known.solved),
@@ -247,11 +241,16 @@ class PairAnswers:
         with self._lock:
             self._fault = reason
             failed = _failing(self._health.reply, reason)
-            self._health = StampedReply(failed, time.monotonic())
-            self._snapshots = {**self._snapshots, "health": SerializedReply.of(failed)}
+            self._health = reply_builders.StampedReply(failed, time.monotonic())
+            self._snapshots = {**self._snapshots, "health": reply_builders.SerializedReply.of(failed)}
         self._context.publish(f"{self._context.keys.root}/{self.name}/health", self.health("msgpack"))
 
     # --- on any -----------------------------------------------------------------------------------------------------
+
+    @property
+    def calibrated(self) -> "PairAnswers":
+        """What a pair with a calibration answers."""
+        return self
 
     @property
     def recorded(self) -> int:
@@ -287,7 +286,9 @@ class PairAnswers:
         """
         camera, lidar = self._pair.camera, self._pair.lidar
         own = (lidar.frame_id, camera.frame_id)
-        exportable = exported(self._known.state, self._vehicle, self.name, own, camera.intrinsics, frames)
+        exportable = reply_builders.exported(
+            self._known.state, self._vehicle, self.name, own, camera.intrinsics, frames
+        )
         if exportable.origin.rejection_reasons:
             raise NotAcceptedError(" ".join(exportable.origin.rejection_reasons))
         written = _EXPORTS[form]
@@ -296,7 +297,9 @@ class PairAnswers:
     def health(self, form: Format) -> Answer:
         """The health, serialised at most a second ago. If it is much older, the answer says so."""
         stamped, reply = self._health, self._health.now()
-        return self._snapshots["health"].answer(form) if reply is stamped.reply else answer_of(reply, form)
+        return (
+            self._snapshots["health"].answer(form) if reply is stamped.reply else reply_builders.answer_of(reply, form)
+        )
 
     def history(self, since_ns: int, until_ns: int, limit: int) -> replies.HistoryReply:
         """Past results, other entries and checks with a sensor stamp in the bounds, the newest `limit` of each. Entries
@@ -374,7 +377,7 @@ class PairAnswers:
 
     def status(self) -> replies.PairStatus:
         """Counters since the start."""
-        counted = pair_status_of(
+        counted = reply_builders.pair_status_of(
             self.name,
             self._known,
             self._stream.report,
@@ -392,7 +395,7 @@ class PairAnswers:
 
 def _failing(reply: replies.HealthReply, reason: Reason) -> replies.HealthReply:
     """The reply of a service that is about to end for a reason."""
-    health = with_problems(Health(HealthState(reply.state), ()), (reason,))
+    health = reply_builders.with_problems(Health(HealthState(reply.state), ()), (reason,))
     update = {
         "state": health.state.value,
         "level": replies.ROS_LEVELS[health.state.value],
@@ -441,14 +444,14 @@ class PendingPairAnswers:
             level=replies.ROS_LEVELS[HealthState.UNKNOWN.value],
             reasons=reasons_of(reasons),
             metrics={},
-            axes=axes_of(None, CalibrationStatus.NOT_ACCEPTED),
+            axes=reply_builders.axes_of(None, CalibrationStatus.NOT_ACCEPTED),
             needs=(*(reason.text for reason in awaits), *self._absent()),
             data_quality=replies.DataQuality(),
             since_ns=self._since_ns,
             evaluated_ns=None,
             age_s=None,
         )
-        self._snapshot = SerializedReply.of(self.health_reply)
+        self._snapshot = reply_builders.SerializedReply.of(self.health_reply)
         if self._published != reasons:
             self._published = reasons
             self._context.publish(self._context.keys.health(self.name), self._snapshot.answer("msgpack"))
@@ -481,55 +484,13 @@ class PendingPairAnswers:
         """The health: unknown, with the reasons."""
         return self._snapshot.answer(form)
 
-    def extrinsic(self, form: Format) -> Answer:
-        """Always refuses.
+    @property
+    def calibrated(self) -> Never:
+        """Refuses every other question.
 
         Raises:
-            AwaitedError: there is no nominal calibration yet.
+            PendingPairError: there is no nominal calibration yet.
         """
-        del form
-        self._refuse()
-
-    def exported(self, form: str, frames: ExportFrames) -> Answer:
-        """As `extrinsic`."""
-        del form, frames
-        self._refuse()
-
-    def history(self, since_ns: int, until_ns: int, limit: int) -> replies.HistoryReply:
-        """As `extrinsic`, because it depends on the rig whose history it is."""
-        del since_ns, until_ns, limit
-        self._refuse()
-
-    def windows(self, form: Format) -> Answer:
-        """As `extrinsic`."""
-        del form
-        self._refuse()
-
-    def read_window(self, window_id: str, offset: int, length: int) -> bytes:
-        """As `extrinsic`."""
-        del window_id, offset, length
-        self._refuse()
-
-    def events(self) -> replies.EvidenceReply:
-        """As `extrinsic`."""
-        self._refuse()
-
-    def event(self, event_id: str) -> replies.EvidenceEvent:
-        """As `extrinsic`."""
-        del event_id
-        self._refuse()
-
-    def event_overlay(self, event_id: str, side: Side) -> bytes:
-        """As `extrinsic`."""
-        del event_id, side
-        self._refuse()
-
-    def overlay(self, window_id: str | None, *, nominal: bool) -> bytes:
-        """As `extrinsic`."""
-        del window_id, nominal
-        self._refuse()
-
-    def _refuse(self) -> Never:
         raise PendingPairError(_sentence(self._nominal))
 
 

@@ -21,17 +21,8 @@ from coec.calibration.state_machine import AlarmRecord, HealthState, step_betwee
 from coec.calibration.types import Decision, Estimate, Reason, Rig, Uncertainty
 from coec.config import CameraIntrinsics, PairConfig
 from coec.geometry import se3
+from coec.io import serialise
 from coec.io.exported_extrinsic import NOMINAL, ExportedExtrinsic, ExportFrames, ExtrinsicOrigin, between_frames
-from coec.io.serialise import (
-    candidate_of,
-    degrees_and_metres,
-    degrees_or_null,
-    intrinsics_of,
-    number_or_null,
-    reasons_of,
-    result_of,
-    transform_of,
-)
 from coec.io.zenoh.bus import JSON, MSGPACK, Answer
 from coec.schemas import replies
 from coec.schemas.keys import Format
@@ -89,25 +80,25 @@ def extrinsic_of(
         pair=rig.pair,
         camera_frame=rig.camera_frame,
         lidar_frame=rig.lidar_frame,
-        camera_from_lidar=transform_of(state.T_camera_lidar),
+        camera_from_lidar=serialise.transform_of(state.T_camera_lidar),
         cloud_frame=None if cloud is None else cloud.frame_id,
         camera_from_cloud=None
         if cloud is None
-        else transform_of(state.T_camera_lidar @ se3.inverse(cloud.T_cloud_lidar)),
+        else serialise.transform_of(state.T_camera_lidar @ se3.inverse(cloud.T_cloud_lidar)),
         provenance=state.provenance.value,
         status=state.status.value,
         percent_complete=percent_complete,
         axes=axes_of_served(state, rig, accepted),
-        correlation_pitch_height=None if of is None else number_or_null(of.pitch_height),
-        correlation_yaw_side=None if of is None else number_or_null(of.yaw_side),
+        correlation_pitch_height=None if of is None else serialise.number_or_null(of.pitch_height),
+        correlation_yaw_side=None if of is None else serialise.number_or_null(of.yaw_side),
         valid_from_ns=state.valid_from_ns,
         data_stamp_ns=accepted.data_stamp_ns if accepted else None,
         window_id=accepted.window_id if accepted else None,
         config_hash=accepted.config_hash if accepted else config_hash,
-        pending=candidate_of(state) if state.pending else None,
+        pending=serialise.candidate_of(state) if state.pending else None,
         held=state.hold is not None,
         hold=hold_of(state),
-        intrinsics=intrinsics_of(rig.camera),
+        intrinsics=serialise.intrinsics_of(rig.camera),
     )
 
 
@@ -133,8 +124,8 @@ def axes_of_served(state: PairState, rig: Rig, accepted: CalibrationResult | Non
     axes = axes_of(accepted, CalibrationStatus.ACCEPTED)
     if accepted is None or state.track is None or state.track.windows <= 1:
         return axes
-    correction = degrees_and_metres(step_between(rig.T_camera_lidar_nominal, state.T_camera_lidar))
-    sigma = degrees_and_metres(state.track.uncertainty.sigma)
+    correction = serialise.degrees_and_metres(step_between(rig.T_camera_lidar_nominal, state.T_camera_lidar))
+    sigma = serialise.degrees_and_metres(state.track.uncertainty.sigma)
     updated = {
         name: getattr(axes, name).model_copy(
             update={"correction": correction[index], "sigma": sigma[index] if accepted.solved[index] else None}
@@ -193,7 +184,7 @@ def health_of(
         missed: sentences about streams that nobody sends.
     """
     latest = known.state.latest
-    result = None if latest is None else result_of(latest, rig, vehicle)
+    result = None if latest is None else serialise.result_of(latest, rig, vehicle)
     health = with_problems(Health(known.state.health, known.state.reasons), (*known.problems, *problems))
     drift, result_drift = known.drift, known.result_drift
     return replies.HealthReply(
@@ -201,7 +192,7 @@ def health_of(
         pair=pair.name,
         state=health.state.value,
         level=replies.ROS_LEVELS[health.state.value],
-        reasons=reasons_of(health.reasons),
+        reasons=serialise.reasons_of(health.reasons),
         metrics={**(result.metrics if result else {}), **(known.check.metrics if known.check else {})},
         axes=axes_of(result, known.state.status),
         drift=_value(drift),
@@ -294,11 +285,11 @@ def drops_of(losses: Mapping[tuple[str, str], int], unpaired: Mapping[str, int])
 
 
 def _value(drift: BaselineDrift | None) -> replies.Maybe6 | None:
-    return None if drift is None else degrees_or_null(drift.value)
+    return None if drift is None else serialise.degrees_or_null(drift.value)
 
 
 def _sigma(drift: BaselineDrift | None) -> replies.Maybe6 | None:
-    return None if drift is None else degrees_or_null(drift.sigma)
+    return None if drift is None else serialise.degrees_or_null(drift.sigma)
 
 
 def exported(

@@ -6,24 +6,12 @@ from dataclasses import replace
 from functools import partial
 
 import zenoh
-from pydantic import BaseModel
 
 from coec.errors import UsageError
 from coec.io.exported_extrinsic import ExportFrames
 from coec.io.exports import NAMES
 from coec.io.zenoh.bus import Answer, Bus, QueryLane, Request, Route
-from coec.schemas.keys import (
-    LAST,
-    RIG,
-    Format,
-    Keys,
-    parse_evidence_selector,
-    parse_extrinsic_selector,
-    parse_history_selector,
-    parse_overlay_selector,
-    parse_range_selector,
-    parse_selector,
-)
+from coec.schemas import keys as bus_keys
 from coec.service.api import metrics as metrics_text
 from coec.service.api.authorization import CommandHandler
 from coec.service.api.pair_answers import PairAnswers, PendingPairAnswers
@@ -49,7 +37,7 @@ class VehicleRoutes:
 
     def __init__(
         self,
-        keys: Keys,
+        keys: bus_keys.Keys,
         pairs: Mapping[str, AnyPairAnswers],
         command_handler: CommandHandler,
         status: Callable[[], SerializedReply],
@@ -147,14 +135,16 @@ class VehicleRoutes:
         address = self._keys.parse(key)
         if address.resource != "command":
             raise UsageError("the rig takes commands; the estimate of the whole rig is at `rig`")
-        command = Route(key, partial(self._command_handler.handle, RIG, str(address.argument)), QueryLane.COMMANDS)
+        command = Route(
+            key, partial(self._command_handler.handle, bus_keys.RIG, str(address.argument)), QueryLane.COMMANDS
+        )
         return [self._timed(command, "command")]
 
     def _find_last(self, pair: str) -> Callable[[str], Sequence[Route]]:
         """A function that finds the route for the last word of a pair, for queries of that word or of all last words.
         It finds none for queries of something else about a pair that happens to be called `last`."""
-        route = self._timed(Route(self._keys.last(pair), partial(self._last, pair), QueryLane.AT_ONCE), LAST)
-        return lambda key: [route] if key.split("/")[-2] == LAST else []
+        route = self._timed(Route(self._keys.last(pair), partial(self._last, pair), QueryLane.AT_ONCE), bus_keys.LAST)
+        return lambda key: [route] if key.split("/")[-2] == bus_keys.LAST else []
 
     def _last(self, pair: str, request: Request) -> Answer:
         return self._heartbeats.answer(pair, _format(request))
@@ -166,7 +156,7 @@ class VehicleRoutes:
             UsageError: the key names no pair of this vehicle.
         """
         pair = key.removeprefix(f"{self._keys.root}/").partition("/")[0]
-        if _has_wildcard(key) or key in self._vehicle_routes or pair in (*self._pairs, RIG, LAST):
+        if _has_wildcard(key) or key in self._vehicle_routes or pair in (*self._pairs, bus_keys.RIG, bus_keys.LAST):
             return []
         raise UsageError(f"no such pair or resource; pairs served here: {', '.join(self._pairs)}")
 
@@ -176,8 +166,8 @@ class VehicleRoutes:
             Route(keys.extrinsic(name), lambda request: _extrinsic(pair, request), QueryLane.AT_ONCE),
             Route(keys.health(name), lambda request: pair.health(_format(request)), QueryLane.AT_ONCE),
             self._metered(Route(keys.history(name), lambda request: _history(pair, request), QueryLane.FILES)),
-            Route(keys.windows(name), lambda request: pair.windows(_format(request)), QueryLane.FILES),
-            Route(keys.evidence(name), lambda request: _in_format(request, pair.events), QueryLane.FILES),
+            Route(keys.windows(name), lambda request: pair.calibrated.windows(_format(request)), QueryLane.FILES),
+            Route(keys.evidence(name), lambda request: _evidence_list(pair, request), QueryLane.FILES),
             self._metered(Route(keys.overlay(name), lambda request: _overlay(pair, request), QueryLane.DRAWING)),
         )
         return {route.key: route for route in routes}
@@ -189,45 +179,45 @@ class VehicleRoutes:
 
     def _window(self, pair: AnyPairAnswers, window_id: str) -> Callable[[Request], Answer]:
         def answer(request: Request) -> Answer:
-            selector = parse_range_selector(request.parameters)
-            return Answer(pair.read_window(window_id, selector.offset, selector.length), OCTETS)
+            selector = bus_keys.parse_range_selector(request.parameters)
+            return Answer(pair.calibrated.read_window(window_id, selector.offset, selector.length), OCTETS)
 
         return answer
 
     def _evidence(self, pair: AnyPairAnswers, event_id: str) -> Callable[[Request], Answer]:
         def answer(request: Request) -> Answer:
-            selector = parse_evidence_selector(request.parameters)
+            selector = bus_keys.parse_evidence_selector(request.parameters)
             if selector.overlay is not None:
-                return Answer(pair.event_overlay(event_id, selector.overlay), JPEG)
-            return answer_of(pair.event(event_id), selector.format)
+                return Answer(pair.calibrated.event_overlay(event_id, selector.overlay), JPEG)
+            return answer_of(pair.calibrated.event(event_id), selector.format)
 
         return answer
 
 
 def _extrinsic(pair: AnyPairAnswers, request: Request) -> Answer:
-    selector = parse_extrinsic_selector(request.parameters, NAMES)
+    selector = bus_keys.parse_extrinsic_selector(request.parameters, NAMES)
     if selector.export is None:
-        return pair.extrinsic(selector.format)
-    return pair.exported(selector.export, ExportFrames(selector.parent, selector.child))
+        return pair.calibrated.extrinsic(selector.format)
+    return pair.calibrated.exported(selector.export, ExportFrames(selector.parent, selector.child))
 
 
 def _overlay(pair: AnyPairAnswers, request: Request) -> Answer:
-    selector = parse_overlay_selector(request.parameters)
-    return Answer(pair.overlay(selector.window_id, nominal=selector.at == "nominal"), JPEG)
+    selector = bus_keys.parse_overlay_selector(request.parameters)
+    return Answer(pair.calibrated.overlay(selector.window_id, nominal=selector.at == "nominal"), JPEG)
 
 
 def _history(pair: AnyPairAnswers, request: Request) -> Answer:
-    selector = parse_history_selector(request.parameters)
-    return answer_of(pair.history(selector.since_ns, selector.until_ns, selector.limit), selector.format)
+    selector = bus_keys.parse_history_selector(request.parameters)
+    return answer_of(pair.calibrated.history(selector.since_ns, selector.until_ns, selector.limit), selector.format)
 
 
-def _in_format(request: Request, make: Callable[[], BaseModel]) -> Answer:
+def _evidence_list(pair: AnyPairAnswers, request: Request) -> Answer:
     form = _format(request)
-    return answer_of(make(), form)
+    return answer_of(pair.calibrated.events(), form)
 
 
-def _format(request: Request) -> Format:
-    return parse_selector(request.parameters).format
+def _format(request: Request) -> bus_keys.Format:
+    return bus_keys.parse_selector(request.parameters).format
 
 
 def _always(route: Route) -> Callable[[str], Sequence[Route]]:

@@ -8,36 +8,16 @@ machine.
 import logging
 from collections import deque
 
-from coec.calibration.frames.window import (
-    CarriedOverPairs,
-    CheckSampler,
-    PairBetween,
-    PairSelected,
-    SliceClosed,
-    UrgentWindow,
-    WindowCutter,
-    stands,
-)
+from coec.calibration.frames import window
 from coec.calibration.types import FramePair, Rig
 from coec.config import MAX_SLICE_S, LimitsConfig, PairConfig
 from coec.io.depth.depth_maps import STEREO
 from coec.io.images import CompressingReducer, Inspector
 from coec.io.logs import LossCounter
 from coec.service.cpu_budget import Budget
-from coec.service.engine.messages import (
-    Action,
-    CheckSubject,
-    PairSchedule,
-    Prefetch,
-    RecordBetween,
-    RecordPair,
-    SelectionChange,
-    SelectionStatistics,
-    SubmitCheck,
-    UseCalibration,
-    WindowSubject,
-)
+from coec.service.engine import messages
 from coec.service.engine.rig import RigMember
+from coec.service.recording.recorder import RecordBetween, RecordPair
 from coec.service.recording.window_store import start_ns_of
 from coec.service.records.pair_store import ServedExtrinsic
 from coec.service.timing import NS_PER_S, SensorClock
@@ -70,12 +50,12 @@ class FrameSelector:
         limits: LimitsConfig,
         rig: Rig,
         served: ServedExtrinsic,
-        schedule: PairSchedule,
+        schedule: messages.PairSchedule,
         budget: Budget,
         member: RigMember,
         losses: LossCounter,
         first_slice_s: float,
-        carried_over: CarriedOverPairs | None = None,
+        carried_over: window.CarriedOverPairs | None = None,
     ) -> None:
         """`served` is the extrinsic at which frame pairs are evaluated until another is served. `carried_over` are
         pairs of an earlier run that belong to the first window."""
@@ -87,13 +67,13 @@ class FrameSelector:
         # The period stays that of the start, because the due times of open requests were set by it.
         self._period_ns = round(pair.monitor.period_s * NS_PER_S)
         self._window, self._stretch = pair.window, 1.0
-        self._cutter = WindowCutter(pair.window, rig, Inspector(limits), CompressingReducer(limits))
+        self._cutter = window.WindowCutter(pair.window, rig, Inspector(limits), CompressingReducer(limits))
         if first_slice_s < pair.window.slice_s:
             self._cutter.hurry(first_slice_s)
         if carried_over is not None:
             self._cutter.carry_over(carried_over)
-        self._sampler = CheckSampler(pair.monitor)
-        self._urgency = UrgentWindow(pair.monitor)
+        self._sampler = window.CheckSampler(pair.monitor)
+        self._urgency = window.UrgentWindow(pair.monitor)
         self._pace = SensorClock()
         self._waiting_checks: deque[tuple[FramePair, ...]] = deque(maxlen=CHECKS_WAITING)
         self._waits_its_turn = False
@@ -106,9 +86,9 @@ class FrameSelector:
         self._logged_s = -PROGRESS_S
 
     @property
-    def statistics(self) -> SelectionStatistics:
+    def statistics(self) -> messages.SelectionStatistics:
         """What was selected so far."""
-        return SelectionStatistics(
+        return messages.SelectionStatistics(
             self._cutter.selected,
             tuple((cause, count) for cause, count in self._cutter.rejections.items() if count),
             self._cutter.last_quality,
@@ -150,10 +130,10 @@ class FrameSelector:
 
     # --- selection --------------------------------------------------------------------------------------------------
 
-    def select(self, pair: FramePair) -> list[Action]:
+    def select(self, pair: FramePair) -> list[messages.Action]:
         """Evaluates the next frame pair and uses it for the window, for a check, or not at all."""
         stamp_ns = pair.stamp_ns
-        actions: list[Action] = []
+        actions: list[messages.Action] = []
         if self.is_step_back(stamp_ns):
             self._schedule.bring_forward(stamp_ns)
             actions += self._apply_due(stamp_ns)
@@ -177,7 +157,7 @@ class FrameSelector:
             actions += self._submit_checks(stamp_ns)
         return actions
 
-    def end_slice(self) -> list[Action]:
+    def end_slice(self) -> list[messages.Action]:
         """Ends the open slice at its end, whether a frame pair or silence tells the time; the results that count by
         then take effect first. So the result of its window counts from the same time on in both cases."""
         end_ns = self._cutter.slice_end_ns
@@ -191,7 +171,7 @@ class FrameSelector:
             self._urgency.on_slice_closed(closed, self._cutter, self._pace.rate_hz)
         return actions
 
-    def finish(self) -> SliceClosed | None:
+    def finish(self) -> window.SliceClosed | None:
         """Ends the open slice at once; None if none is open. The `SliceClosed` is an action."""
         for closed in self._cutter.finish():
             return self._close(closed, self._last_ns or 0)
@@ -199,7 +179,7 @@ class FrameSelector:
 
     # --- changes by results -----------------------------------------------------------------------------------------
 
-    def apply(self, change: SelectionChange) -> list[Action]:
+    def apply(self, change: messages.SelectionChange) -> list[messages.Action]:
         """Takes over what a result changes."""
         if change.served is not None and change.served.epoch > self._served.epoch:
             self._served = change.served
@@ -211,9 +191,9 @@ class FrameSelector:
         if change.urgent_since_ns is not None:
             self._suspected = True
             self._urgency.alarm(change.urgent_since_ns)
-        return [] if change.calibration is None else [UseCalibration(change.calibration)]
+        return [] if change.calibration is None else [messages.UseCalibration(change.calibration)]
 
-    def _apply_due(self, stamp_ns: int) -> list[Action]:
+    def _apply_due(self, stamp_ns: int) -> list[messages.Action]:
         return [action for change in self._schedule.take_due(stamp_ns) for action in self.apply(change)]
 
     def _begin_new_time(self, stamp_ns: int) -> None:
@@ -241,20 +221,20 @@ class FrameSelector:
         if since_ns is not None and since_ns > self._latest_window_ns and not self._urgency.is_waiting:
             self._urgency.request(since_ns, self._budget.window_turn_s(self._pair.name, stamp_ns))
 
-    def _offer_to_window(self, pair: FramePair) -> list[Action]:
-        actions: list[Action] = []
+    def _offer_to_window(self, pair: FramePair) -> list[messages.Action]:
+        actions: list[messages.Action] = []
         frozen_before = self._cutter.rejections["frozen"]
         T_camera_lidar = self._served.T_camera_lidar
         for event in self._cutter.offer(pair, T_camera_lidar):
-            if isinstance(event, PairSelected):
+            if isinstance(event, window.PairSelected):
                 self._frozen = False
                 actions.append(RecordPair(event.window_id, event.pair, T_camera_lidar))
                 if self._infers:
-                    actions.append(Prefetch(event.pair.camera))
+                    actions.append(messages.Prefetch(event.pair.camera))
                 self._log_progress(event.window_id)
-            elif isinstance(event, PairBetween):
+            elif isinstance(event, window.PairBetween):
                 actions.append(RecordBetween(event.window_id, event.pair))
-            elif isinstance(event, SliceClosed):
+            elif isinstance(event, window.SliceClosed):
                 actions.append(self._close(event, pair.stamp_ns))
                 self._urgency.on_slice_closed(event, self._cutter, self._pace.rate_hz)
             else:
@@ -275,32 +255,34 @@ class FrameSelector:
             self._losses.add("monitor", "check_superseded")
         self._waiting_checks.append(check)
 
-    def _submit_checks(self, stamp_ns: int) -> list[Action]:
+    def _submit_checks(self, stamp_ns: int) -> list[messages.Action]:
         """Has the latest frame pairs checked at the served extrinsic when it is their turn. Not called while a window
         is to change that extrinsic, because the check would judge one that is no longer served."""
         self._waits_its_turn = False
-        actions: list[Action] = []
+        actions: list[messages.Action] = []
         while self._waiting_checks:
             if not self._budget.try_acquire(self._pair.name, stamp_ns, suspected=self._suspected):
                 self._waits_its_turn = True
                 break
             self._checks += 1
             pairs = self._waiting_checks.popleft()
-            standing = tuple(pair.stamp_ns for pair in pairs if stands(pair, self._pair.window))
+            standing = tuple(pair.stamp_ns for pair in pairs if window.stands(pair, self._pair.window))
             request = self._schedule.submit(
-                CheckSubject(self._served.epoch, standing),
+                messages.CheckSubject(self._served.epoch, standing),
                 stamp_ns + RESULT_PERIODS * self._period_ns,
                 self.expires_s(Kind.CHECK),
             )
-            actions.append(SubmitCheck(request, pairs, self._served, self._pair.calibration))
+            actions.append(messages.SubmitCheck(request, pairs, self._served, self._pair.calibration))
         return actions
 
-    def _close(self, closed: SliceClosed, stamp_ns: int) -> SliceClosed:
+    def _close(self, closed: window.SliceClosed, stamp_ns: int) -> window.SliceClosed:
         """A slice ended at this sensor time: its frame pairs go to the disk, and from there to the worker."""
         if closed.complete:
             self._latest_window_ns = start_ns_of(closed.window_id)
             due_ns = stamp_ns + RESULT_PERIODS * self._period_ns
-            request = self._schedule.submit(WindowSubject(closed.window_id), due_ns, self.expires_s(Kind.SOLVE))
+            request = self._schedule.submit(
+                messages.WindowSubject(closed.window_id), due_ns, self.expires_s(Kind.SOLVE)
+            )
             self._window_due_ns = request.due_ns
         fields = {
             "pair": self._pair.name,

@@ -17,7 +17,7 @@ from coec.schemas.replies import CheckReply
 from coec.service.engine.rig import PairCorrection
 from coec.service.engine.schedule import Request, Schedule
 from coec.service.ingest.decoder import StreamCounts
-from coec.service.recording.recorder import WindowLost, WindowRecorded
+from coec.service.recording.recorder import RecordBetween, RecordPair, WindowLost, WindowRecorded
 from coec.service.records.incidents import Side
 from coec.service.records.pair_store import ServedExtrinsic
 from coec.service.worker.worker_jobs import JobOutcome
@@ -224,24 +224,6 @@ Event = SensorTime | Evaluate | JobDone | WindowRecorded | WindowLost | Tick | R
 """What comes into a pair."""
 
 # --- actions --------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RecordPair:
-    """A frame pair was selected for a window, whose search will start at `T_camera_lidar` (4, 4) if it is the
-    first."""
-
-    window_id: str
-    pair: FramePair
-    T_camera_lidar: Matrix4
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RecordBetween:
-    """A thinned frame pair is to be recorded beside the selected ones."""
-
-    window_id: str
-    pair: FramePair
 
 
 @dataclass(frozen=True, slots=True)

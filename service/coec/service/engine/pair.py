@@ -27,32 +27,9 @@ from coec.io.logs import LossCounter
 from coec.io.serialise import check_of, estimate_of, matrix_of
 from coec.reports.formatting import hold_text
 from coec.schemas.replies import CalibrationResult, CheckReply, EvidenceEvent
+from coec.service.engine import messages
 from coec.service.engine.check_progress import Attempts, CheckProgress
 from coec.service.engine.frame_selector import GRACE_S, FrameSelector
-from coec.service.engine.messages import (
-    Action,
-    CheckSubject,
-    CommissioningSubject,
-    Evaluate,
-    Event,
-    JobDone,
-    KeepSnippet,
-    PairRequest,
-    PairResult,
-    PairSchedule,
-    PairSnapshot,
-    PictureSubject,
-    Publish,
-    Reconfigured,
-    SelectionChange,
-    SensorTime,
-    StreamStatistics,
-    SubmitPicture,
-    SubmitSolve,
-    Tick,
-    UseCalibration,
-    WindowSubject,
-)
 from coec.service.engine.rig import PairCorrection, RigMember
 from coec.service.recording.recorder import WindowLost, WindowRecorded
 from coec.service.recording.window_store import WindowVersion, start_ns_of
@@ -107,7 +84,7 @@ class Pair:
         stale_after_s: float,
         store: PairStore,
         baseline: RigBaseline,
-        schedule: PairSchedule,
+        schedule: messages.PairSchedule,
         selector: FrameSelector,
         member: RigMember,
         losses: LossCounter,
@@ -124,7 +101,7 @@ class Pair:
         self._member = member
         self._losses = losses
         self._clock = clock
-        self._statistics = StreamStatistics()
+        self._statistics = messages.StreamStatistics()
         self._clocks_checked_s = self._counted_s = clock.monotonic_s()
         selector.tick(self._counted_s)
         self._progress = CheckProgress(pair.monitor.period_s, clock.monotonic_s(), self._statistics)
@@ -136,7 +113,7 @@ class Pair:
         self._has_changed = True
         self.is_unpublished = False
         self._health = store.state.health
-        self._actions: list[Action] = []
+        self._actions: list[messages.Action] = []
 
     # --- for the caller: predicates, which change nothing -----------------------------------------------------------
 
@@ -154,7 +131,7 @@ class Pair:
         return self._schedule.unanswered
 
     @property
-    def oldest_request(self) -> PairRequest | None:
+    def oldest_request(self) -> messages.PairRequest | None:
         """The request whose result is to be concluded next; None if there is none."""
         return self._schedule.oldest
 
@@ -164,11 +141,11 @@ class Pair:
         can_publish = self.is_unpublished and self.store.may_be_published()
         return self._has_changed or can_publish or monotonic_s - self._clocks_checked_s >= TICK_S
 
-    def snapshot(self) -> PairSnapshot:
+    def snapshot(self) -> messages.PairSnapshot:
         """What is known now."""
         state, latest = self.store.state, self.store.state.latest
         accepted = None if state.accepted is None else state.accepted.sigma
-        return PairSnapshot(
+        return messages.PairSnapshot(
             state=state,
             served=self.store.served,
             check=self._latest_check,
@@ -185,27 +162,31 @@ class Pair:
 
     # --- events -----------------------------------------------------------------------------------------------------
 
-    def step(self, event: Event) -> list[Action]:
+    def step(self, event: messages.Event) -> list[messages.Action]:
         """Takes an event; returns what is to be done, in order."""
         match event:
-            case SensorTime():
+            case messages.SensorTime():
                 self._advance(event.stamp_ns)
-            case Evaluate():
+            case messages.Evaluate():
                 self._evaluate(event.pair, is_forced=event.is_forced)
-            case JobDone():
+            case messages.JobDone():
                 self._on_job(event)
             case WindowRecorded():
-                self._actions.append(SubmitSolve(WindowSubject(event.window_id, event.live), event.path))
+                self._actions.append(
+                    messages.SubmitSolve(messages.WindowSubject(event.window_id, event.live), event.path)
+                )
             case WindowLost():
-                self._on_lost(event.window_id)
-            case Tick():
+                request = self._schedule.unanswered_about(messages.WindowSubject(event.window_id))
+                if request is not None:
+                    self._answer(request, _NOT_RECORDED)
+            case messages.Tick():
                 self._tick(event)
-            case Reconfigured():
+            case messages.Reconfigured():
                 self._reconfigure(event)
         self._note_event()
         return self.take_actions()
 
-    def take_actions(self) -> list[Action]:
+    def take_actions(self) -> list[messages.Action]:
         """What is to be done since the last step."""
         actions, self._actions = self._actions, []
         return actions
@@ -245,7 +226,7 @@ class Pair:
         self._actions += self.selector.select(pair)
         since_ns = self.store.state.flagged_since_ns
         if steps_back and since_ns is not None:
-            self._actions += self.selector.apply(SelectionChange(urgent_since_ns=since_ns))
+            self._actions += self.selector.apply(messages.SelectionChange(urgent_since_ns=since_ns))
 
     def _begin_new_time(self, stamp_ns: int) -> None:
         """The clock of the sensors has stepped back, to this stamp."""
@@ -255,7 +236,7 @@ class Pair:
         self._has_changed = True
         self.store.update(lambda state: lifecycle.time_stepped_back(state, stamp_ns), stamp_ns, completed=False)
 
-    def _tick(self, event: Tick) -> None:
+    def _tick(self, event: messages.Tick) -> None:
         """Gives up requests that have waited too long, ages the state, and publishes it."""
         now_s = self._clock.monotonic_s()
         self._clocks_checked_s, self._has_changed = now_s, False
@@ -270,12 +251,12 @@ class Pair:
         # As long as the disk is only busy, nothing is published that a restart would not know.
         self.is_unpublished = not self.store.may_be_published()
         if not self.is_unpublished:
-            self._actions.append(Publish(self.snapshot()))
+            self._actions.append(messages.Publish(self.snapshot()))
 
     def publish(self) -> None:
         """Publishes what is known, even if it is not on the disk yet."""
         self.is_unpublished = False
-        self._actions.append(Publish(self.snapshot()))
+        self._actions.append(messages.Publish(self.snapshot()))
 
     def _note_event(self) -> None:
         """If the pair has just entered a state of `INCIDENT_STATES`, the seconds around it are kept. This changes no
@@ -283,33 +264,33 @@ class Pair:
         before, state = self._health, self.store.state
         self._health = state.health
         if state.health is not before and state.health in INCIDENT_STATES:
-            self._actions.append(KeepSnippet(state.health.value, state.T_camera_lidar))
+            self._actions.append(messages.KeepSnippet(state.health.value, state.T_camera_lidar))
 
-    def _reconfigure(self, event: Reconfigured) -> None:
+    def _reconfigure(self, event: messages.Reconfigured) -> None:
         self._rules = PairRules(event.pair.policy, event.pair.tracker, event.pair.monitor)
         self._stale_after_s = event.stale_after_s
         self.selector.reconfigure(event.pair)
         self._baseline.reconfigure(event.pair)
-        self._actions.append(UseCalibration(self._baseline.calibration))
+        self._actions.append(messages.UseCalibration(self._baseline.calibration))
         self.store.note_command("reload", "reloaded", event.history_text, "SIGHUP", accepted=True)
         self.store.save()
         self._has_changed = True
 
     # --- outcomes ---------------------------------------------------------------------------------------------------
 
-    def _on_job(self, event: JobDone) -> None:
+    def _on_job(self, event: messages.JobDone) -> None:
         self._has_changed = True
         match event.subject:
-            case WindowSubject():
+            case messages.WindowSubject():
                 self._on_solved(event.subject, event.outcome)
-            case PictureSubject():
+            case messages.PictureSubject():
                 self._on_picture(event.subject, event.outcome)
-            case CommissioningSubject():
+            case messages.CommissioningSubject():
                 self._on_commissioned(event.subject.window_ids, event.outcome)
             case request:
                 self._answer(request, event.outcome)
 
-    def _on_solved(self, subject: WindowSubject, outcome: JobOutcome) -> None:
+    def _on_solved(self, subject: messages.WindowSubject, outcome: JobOutcome) -> None:
         """The solve of a window has ended. If no request waits for it, it was solved by command, or is of an earlier
         run: then it counts at once."""
         request = self._schedule.unanswered_about(subject) if subject.live else None
@@ -318,38 +299,33 @@ class Pair:
         else:
             self._apply(self._conclude_window(None, subject, outcome))
 
-    def _on_lost(self, window_id: str) -> None:
-        request = self._schedule.unanswered_about(WindowSubject(window_id))
-        if request is not None:
-            self._answer(request, _NOT_RECORDED)
-
-    def _answer(self, request: PairRequest, result: PairResult) -> None:
+    def _answer(self, request: messages.PairRequest, result: messages.PairResult) -> None:
         """A result has come: concludes all whose turn it is. A second result of a request is ignored."""
         self._has_changed = True
         self._schedule.answer(request, result)
         while (answered := self._schedule.next_answered()) is not None:
             self._schedule.conclude(answered, self._conclude(answered))
 
-    def _apply(self, change: SelectionChange | None) -> None:
+    def _apply(self, change: messages.SelectionChange | None) -> None:
         """Applies a change that no sensor time delays."""
         if change is not None:
             self._actions += self.selector.apply(change)
 
-    def _conclude(self, request: PairRequest) -> SelectionChange | None:
+    def _conclude(self, request: messages.PairRequest) -> messages.SelectionChange | None:
         """Takes a result into the state; returns what it changes in the selection."""
         subject, result = request.subject, request.result
         assert result is not None  # `next_answered` returns no other
         match subject:
-            case CheckSubject():
+            case messages.CheckSubject():
                 return self._conclude_check(request, subject, result)
-            case WindowSubject():
+            case messages.WindowSubject():
                 return self._conclude_window(request, subject, result)
             case PairCorrection():
                 return self._conclude_correction(request, subject)
 
     def _conclude_check(
-        self, request: PairRequest, subject: CheckSubject, result: PairResult
-    ) -> SelectionChange | None:
+        self, request: messages.PairRequest, subject: messages.CheckSubject, result: messages.PairResult
+    ) -> messages.SelectionChange | None:
         answer = result.answer if isinstance(result, JobOutcome) else None
         if not isinstance(answer, Checked):
             reason = _why_not(result)
@@ -380,8 +356,8 @@ class Pair:
         return self._with_calibration(change) if refused else change
 
     def _conclude_window(
-        self, request: PairRequest | None, subject: WindowSubject, result: PairResult
-    ) -> SelectionChange | None:
+        self, request: messages.PairRequest | None, subject: messages.WindowSubject, result: messages.PairResult
+    ) -> messages.SelectionChange | None:
         answer = result.answer if isinstance(result, JobOutcome) else None
         if not isinstance(answer, Solved):
             return self._conclude_failure(_why_not(result), live=subject.live)
@@ -406,7 +382,7 @@ class Pair:
             self.store.save()
         return change if fits else self._with_calibration(change)
 
-    def _conclude_failure(self, reason: Reason, *, live: bool) -> SelectionChange | None:
+    def _conclude_failure(self, reason: Reason, *, live: bool) -> messages.SelectionChange | None:
         if reason.code == STOPPING.code:
             return None  # the window stays on the disk, and is solved after the next start
         self._losses.add("window", reason.code, detail=reason.text)
@@ -415,7 +391,9 @@ class Pair:
         self._window_attempts.failed(reason)
         return self._update(lambda state: lifecycle.after_failure(state, reason), None, completed=False)
 
-    def _judge(self, request: PairRequest | None, result: CalibrationResult) -> SelectionChange | None:
+    def _judge(
+        self, request: messages.PairRequest | None, result: CalibrationResult
+    ) -> messages.SelectionChange | None:
         estimate, start_ns = self._baseline.unbiased(estimate_of(result)), start_ns_of(result.window_id)
         # When the result counts, whenever it came: a replay decides alike.
         now_ns = self.selector.statistics.last_ns if request is None else request.due_ns
@@ -438,7 +416,9 @@ class Pair:
         carried_over = lifecycle.carried_over_pairs(estimate)
         return change if carried_over is None or change is None else replace(change, carried_over=carried_over)
 
-    def _conclude_correction(self, request: PairRequest, correction: PairCorrection) -> SelectionChange | None:
+    def _conclude_correction(
+        self, request: messages.PairRequest, correction: PairCorrection
+    ) -> messages.SelectionChange | None:
         """Serves the correction that the rig found for all pairs of a moved sensor together, as far as the policy
         allows it."""
         state = self.store.state
@@ -468,7 +448,7 @@ class Pair:
             self.store.save()
             return
         self._baseline.load()
-        self._actions.append(UseCalibration(self._baseline.calibration))
+        self._actions.append(messages.UseCalibration(self._baseline.calibration))
         some = f"{answer.windows} window{'' if answer.windows == 1 else 's'}"
         text = f"Commissioned from {some}, {answer.pairs} pairs; baseline {answer.baseline_hash}."
         self.store.note_commissioned(text, window_ids)
@@ -479,7 +459,7 @@ class Pair:
         """A person has replaced the extrinsic, so no earlier check is about the served one."""
         self._latest_check = None
         self._member.serves(None, self.store.state)
-        self._apply(SelectionChange(served=self.store.served, is_calm=True))
+        self._apply(messages.SelectionChange(served=self.store.served, is_calm=True))
 
     # --- the state --------------------------------------------------------------------------------------------------
 
@@ -489,10 +469,10 @@ class Pair:
         stamp_ns: int | None,
         *,
         completed: bool,
-        request: PairRequest | None = None,
+        request: messages.PairRequest | None = None,
         epoch: int | None = None,
         by_check: bool = False,
-    ) -> SelectionChange | None:
+    ) -> messages.SelectionChange | None:
         """Changes the state, and has the picture of a red event rendered. Returns what that changes in the selection;
         None if the step was meant for another extrinsic."""
         taken = self.store.update(step, stamp_ns, completed=completed, epoch=epoch)
@@ -511,9 +491,9 @@ class Pair:
             self._render_beginning(event, after)
         return _selection_change(taken, by_check=by_check)
 
-    def _with_calibration(self, change: SelectionChange | None) -> SelectionChange:
+    def _with_calibration(self, change: messages.SelectionChange | None) -> messages.SelectionChange:
         """The change, and with it another configuration for the windows that begin once this result counts."""
-        return replace(change or SelectionChange(), calibration=self._baseline.calibration)
+        return replace(change or messages.SelectionChange(), calibration=self._baseline.calibration)
 
     # --- evidence ---------------------------------------------------------------------------------------------------
 
@@ -537,8 +517,8 @@ class Pair:
             self._render_both_sides(event, latest.optimum.T_camera_lidar, latest.verdict.decision.value)
         elif event.window_before is not None:
             self._actions.append(
-                SubmitPicture(
-                    PictureSubject(event.event_id, "before"),
+                messages.SubmitPicture(
+                    messages.PictureSubject(event.event_id, "before"),
                     event.window_before,
                     (matrix_of(event.camera_from_lidar),),
                     (f"{event.window_before}  at {SERVED_CAPTION}",),
@@ -551,10 +531,10 @@ class Pair:
         captions = (SERVED_CAPTION, f"found by the window after it ({decision})")
         for side, window_id in (("before", event.window_before), ("after", event.window_after)):
             if window_id is not None:
-                subject = PictureSubject(event.event_id, "before" if side == "before" else "after")
-                self._actions.append(SubmitPicture(subject, window_id, poses, captions))
+                subject = messages.PictureSubject(event.event_id, "before" if side == "before" else "after")
+                self._actions.append(messages.SubmitPicture(subject, window_id, poses, captions))
 
-    def _on_picture(self, subject: PictureSubject, outcome: JobOutcome) -> None:
+    def _on_picture(self, subject: messages.PictureSubject, outcome: JobOutcome) -> None:
         if isinstance(outcome.answer, RenderedImage):
             self.store.add_picture(subject.event_id, subject.side, outcome.answer.jpeg)
         elif outcome.reason is not None:
@@ -616,21 +596,23 @@ class Pair:
         return tuple(reason for reason in (*own, held) if reason is not None and reason.code not in reported)
 
 
-def _why_not(result: PairResult) -> Reason:
+def _why_not(result: messages.PairResult) -> Reason:
     """Why there is no answer."""
     if isinstance(result, Reason):
         return result
     return (result.reason if isinstance(result, JobOutcome) else None) or _NO_ANSWER
 
 
-def _selection_change(taken: StateTransition, *, by_check: bool) -> SelectionChange:
+def _selection_change(taken: StateTransition, *, by_check: bool) -> messages.SelectionChange:
     """What a change of the state changes in the selection: the extrinsic at which frame pairs are evaluated, and
     whether a window is wanted soon. It is if the monitor's outcome or health has changed, if a window did not settle
     the suspicion, or if a window saw a step."""
     before, after = taken.before, taken.after
     since_ns = lifecycle.urgent_window_since(after)
     if since_ns is None:
-        return SelectionChange(taken.served, is_calm=True)
+        return messages.SelectionChange(taken.served, is_calm=True)
     waiting = after.pending is not None and after.pending.contradicts
     unchanged = before.monitor.outcome is after.monitor.outcome and before.seen is after.seen
-    return SelectionChange(taken.served, urgent_since_ns=None if waiting or (by_check and unchanged) else since_ns)
+    return messages.SelectionChange(
+        taken.served, urgent_since_ns=None if waiting or (by_check and unchanged) else since_ns
+    )

@@ -6,15 +6,14 @@ from collections import deque
 from collections.abc import Mapping
 
 from coec.calibration.frames.pairing import Pairer
-from coec.calibration.types import FramePair, Matrix4
+from coec.calibration.types import Frame, FramePair, Matrix4
 from coec.config import Config, PairConfig
 from coec.io.logs import LossCounter
 from coec.service.engine.messages import SelectionStatistics, StreamStatistics
 from coec.service.engine.vehicle import Vehicle
-from coec.service.ingest.decoder import LIDAR, Frame
+from coec.service.ingest.decoder import LIDAR, SensorStream
 from coec.service.ingest.frame_buffers import FrameRing, PairBuffer
 from coec.service.ingest.inbox import Arrivals
-from coec.service.ingest.sensor_stream import SensorStream
 from coec.service.timing import NS_PER_S, QUICK_S, Histogram, SensorClock
 
 GRACE_NS = NS_PER_S

@@ -213,11 +213,6 @@ class ReportSchedule(Generic[T]):
         self.taken_ns = max(self.taken_ns, report.due_ns if not self._waiting else self.taken_ns)
         self._advance()
 
-    @property
-    def is_ready(self) -> bool:
-        """Whether a report can be taken."""
-        return bool(self._waiting) and self._waiting[0].due_ns <= self._passed_ns()
-
     def step_back(self, stamp_ns: int, what: T) -> None:
         """Sensor time has stepped back to this stamp. Waiting reports still count; then comes `what`, and after it the
         new time."""

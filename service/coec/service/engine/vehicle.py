@@ -10,16 +10,16 @@ which they came, frames are handed on without a lock, and what a turn does depen
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
+from coec.calibration.types import Frame
 from coec.config import KnownStreamConfig, LimitsConfig, PairConfig
 from coec.io.system import ServiceThread
 from coec.io.zenoh.bus import InputSample
 from coec.service.cpu_budget import Budget
 from coec.service.engine.messages import JobDone, JobSubject
 from coec.service.engine.rig import RigEstimator, RigSnapshot
-from coec.service.ingest.decoder import Frame
+from coec.service.ingest.decoder import SensorStream, read_alike
 from coec.service.ingest.frame_buffers import FrameBudget, WaitingFrames
 from coec.service.ingest.inbox import Arrivals, Inbox, Parcel, Posted
-from coec.service.ingest.sensor_stream import SensorStream, read_alike
 from coec.service.timing import Clock
 from coec.service.worker.worker_jobs import JobOutcome
 

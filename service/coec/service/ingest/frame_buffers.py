@@ -10,9 +10,8 @@ from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, Matrix4
+from coec.calibration.types import CameraFrame, EgoMotion, Frame, FramePair, LidarFrame, Matrix4
 from coec.config import SnippetsConfig
-from coec.service.ingest.decoder import Frame
 
 
 class FrameBudget:
@@ -35,7 +34,7 @@ class FrameBudget:
             self._bytes -= self._freed.popleft()
         return self._bytes
 
-    def admit(self, frame: CameraFrame | LidarFrame | EgoMotion) -> bool:
+    def admit(self, frame: Frame) -> bool:
         """Counts a frame if there is room for it; else returns False."""
         size = frame_bytes(frame)
         if self.bytes + size > self._max_bytes:
@@ -45,7 +44,7 @@ class FrameBudget:
         return True
 
 
-def frame_bytes(frame: CameraFrame | LidarFrame | EgoMotion) -> int:
+def frame_bytes(frame: Frame) -> int:
     """Bytes of the images and points of a frame; everything else is negligible."""
     match frame:
         case CameraFrame():

@@ -20,8 +20,7 @@ from coec.config import CalibrationConfig
 from coec.errors import CoecError, RecordingError, WindowError
 from coec.io import storage
 from coec.io.logs import LossCounter
-from coec.io.mcap.window_reader import pairs_since, read_result
-from coec.io.mcap.window_writer import RecordedWindow, WindowWriter, salvage
+from coec.io.mcap.windows import RecordedWindow, WindowWriter, pairs_since, read_result, salvage
 from coec.io.system import ServiceThread
 from coec.schemas.replies import CalibrationResult
 from coec.service.recording.snippets import SnippetRecorder
@@ -165,14 +164,19 @@ DIGEST_PAUSE_S = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Add:
+class RecordPair:
+    """A frame pair was selected for a window, whose search will start at `T_camera_lidar` (4, 4) if it is the
+    first."""
+
     window_id: str
     pair: FramePair
     T_camera_lidar: Matrix4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _AddBetween:
+class RecordBetween:
+    """A thinned frame pair is to be recorded beside the selected ones."""
+
     window_id: str
     pair: FramePair
 
@@ -288,7 +292,7 @@ class Recorder:
         self._thread = recording.thread
         self._post = post
         self._condition = recording.condition
-        self._queue: deque[_Add | _AddBetween | SliceClosed | CalibrationConfig] = deque()
+        self._queue: deque[RecordPair | RecordBetween | SliceClosed | CalibrationConfig] = deque()
         self._adds = 0
         self._betweens = 0
         self._open: _OpenWindow | None = None
@@ -320,47 +324,37 @@ class Recorder:
 
     @property
     def has_room(self) -> bool:
-        """Whether `add` and `add_between` would take a pair now."""
+        """Whether `add` would take a pair now, selected or thinned."""
         return self._adds < PAIRS_WAITING and self._betweens < BETWEEN_WAITING
 
     def reconfigure(self, configuration: CalibrationConfig) -> None:
         """Queues another configuration for the windows that begin after it in the queue. Called when the limits of the
         rig were learned anew, or do not fit the rig."""
-        with self._condition:
-            self._queue.append(configuration)
-            self._condition.notify()
+        self._put(configuration)
 
     def follow(self, plan: RecordingPlan) -> None:
         """Records the next window by this plan. Its configuration of the calibration is ignored; `use` sets that."""
         self._plan = plan
 
-    def add(self, window_id: str, pair: FramePair, T_camera_lidar: Matrix4) -> None:
-        """Queues a chosen pair; never waits for the disk. `T_camera_lidar` (4, 4) is where the search will start if
-        this is the first pair of its window."""
+    def add(self, item: RecordPair | RecordBetween) -> None:
+        """Queues a pair; never waits for the disk."""
+        selected = isinstance(item, RecordPair)
         with self._condition:
-            overrun = self._adds >= PAIRS_WAITING
+            overrun = self._adds >= PAIRS_WAITING if selected else self._betweens >= BETWEEN_WAITING
             if not overrun:
-                self._adds += 1
-                self._queue.append(_Add(window_id, pair, T_camera_lidar))
-                self._condition.notify()
-        if overrun:
-            self._losses.add("window", "recorder_overrun")
-
-    def add_between(self, window_id: str, pair: FramePair) -> None:
-        """Queues a thinned pair to be recorded beside the chosen ones of a window; never waits for the disk."""
-        with self._condition:
-            overrun = self._betweens >= BETWEEN_WAITING
-            if not overrun:
-                self._betweens += 1
-                self._queue.append(_AddBetween(window_id, pair))
-                self._condition.notify()
+                self._adds += selected
+                self._betweens += not selected
+                self._put(item)
         if overrun:
             self._losses.add("window", "recorder_overrun")
 
     def end(self, closed: SliceClosed) -> None:
         """Queues the end of a window. It is finished if it holds enough pairs, else abandoned."""
+        self._put(closed)
+
+    def _put(self, item: RecordPair | RecordBetween | SliceClosed | CalibrationConfig) -> None:
         with self._condition:
-            self._queue.append(closed)
+            self._queue.append(item)
             self._condition.notify()
 
     # --- on the thread of the recorders -----------------------------------------------------------------------------
@@ -378,9 +372,9 @@ class Recorder:
             self._resume()
         with self._condition:
             item = self._queue.popleft() if self._queue else None
-            self._adds -= isinstance(item, _Add)
-            self._betweens -= isinstance(item, _AddBetween)
-        if isinstance(item, (_Add, _AddBetween)):
+            self._adds -= isinstance(item, RecordPair)
+            self._betweens -= isinstance(item, RecordBetween)
+        if isinstance(item, RecordPair | RecordBetween):
             started_s = time.monotonic()
             self._write(item)
             self.writing_took.add(time.monotonic() - started_s)
@@ -451,12 +445,14 @@ class Recorder:
         self._store.hold(window_id)
         self._post(self._plan.rig.pair, WindowRecorded(window_id, path, live))
 
-    def _write(self, item: _Add | _AddBetween) -> None:
+    def _write(self, item: RecordPair | RecordBetween) -> None:
         if item.window_id == self._lost:
             return
         try:
-            if isinstance(item, _AddBetween):
-                self._write_between(item)
+            if isinstance(item, RecordBetween):
+                # A window without a selected pair is not on the disk.
+                if self._open is not None and self._open.window_id == item.window_id:
+                    self._open.writer.add_between(item.pair)
                 return
             if self._open is None or self._open.window_id != item.window_id:
                 self._close_stray()
@@ -466,12 +462,7 @@ class Recorder:
         except (RecordingError, OSError) as error:
             self._lose(item.window_id, error)
 
-    def _write_between(self, item: _AddBetween) -> None:
-        """Writes a thinned pair if its window is open; a window without a chosen pair is not on the disk."""
-        if self._open is not None and self._open.window_id == item.window_id:
-            self._open.writer.add_between(item.pair)
-
-    def _start(self, item: _Add) -> _OpenWindow:
+    def _start(self, item: RecordPair) -> _OpenWindow:
         plan = self._plan  # `follow` may replace it meanwhile
         self._store.make_room(self._thread.beat)
         writer = WindowWriter(

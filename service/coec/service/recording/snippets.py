@@ -17,16 +17,15 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from coec.calibration.types import Rig
+from coec.calibration.types import Frame, Rig
 from coec.errors import CoecError, DecodeError, NotFoundError, RecordingError
 from coec.io import storage
 from coec.io.logs import LossCounter
-from coec.io.mcap.bag_writer import SnippetFile, metadata_of, salvage_snippet
-from coec.io.mcap.window_reader import PART_SUFFIX, REWRITE_SUFFIX, SUFFIX
+from coec.io.mcap.windows import SUFFIX
+from coec.io.mcap.writer import PART_SUFFIX, REWRITE_SUFFIX, SnippetFile, metadata_of, salvage_snippet
 from coec.io.storage import read_piece
 from coec.schemas.message import from_json, to_json
 from coec.schemas.replies import SnippetInfo
-from coec.service.ingest.decoder import Frame
 from coec.service.ingest.frame_buffers import Snippet, frame_bytes
 
 _log = logging.getLogger(__name__)

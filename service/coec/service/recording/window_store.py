@@ -28,8 +28,8 @@ from pydantic import ValidationError
 from coec.config import StateConfig
 from coec.errors import NotFoundError, RecordingError
 from coec.io import storage
-from coec.io.mcap.window_reader import PART_SUFFIX, REWRITE_SUFFIX, SUFFIX
-from coec.io.mcap.window_writer import RecordedWindow
+from coec.io.mcap.windows import SUFFIX, RecordedWindow
+from coec.io.mcap.writer import PART_SUFFIX, REWRITE_SUFFIX
 from coec.io.storage import LineLog, read_piece
 from coec.schemas.message import Part, to_json
 from coec.schemas.replies import Decision, RetentionReason, WindowInfo

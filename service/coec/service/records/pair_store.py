@@ -24,14 +24,6 @@ from coec.io.disk_writer import DiskWriter
 from coec.io.logs import LossCounter
 from coec.io.serialise import transform_of
 from coec.schemas import replies
-from coec.schemas.replies import (
-    CalibrationResult,
-    CheckReply,
-    EvidenceEvent,
-    HistoryEntry,
-    MetricsPoint,
-    RetentionReason,
-)
 from coec.service.recording.window_store import WindowStore, WindowVersion
 from coec.service.records.history import GENESIS, CheckLog, HistoryRecord, PairHistory
 from coec.service.records.incidents import Incidents, Side
@@ -74,11 +66,11 @@ class PairRecords:
     """The books as others see them, oldest first."""
 
     entries: tuple[HistoryRecord, ...]
-    checks: tuple[CheckReply, ...]
-    events: tuple[EvidenceEvent, ...]
+    checks: tuple[replies.CheckReply, ...]
+    events: tuple[replies.EvidenceEvent, ...]
 
     @property
-    def results(self) -> tuple[CalibrationResult, ...]:
+    def results(self) -> tuple[replies.CalibrationResult, ...]:
         """Results of windows."""
         return tuple(record.result for record in self.entries if record.result is not None)
 
@@ -204,21 +196,21 @@ class PairStore:
         self.save()
         return StateTransition(before, after, self.served)
 
-    def note_result(self, result: CalibrationResult) -> None:
+    def note_result(self, result: replies.CalibrationResult) -> None:
         """A window was solved."""
         reasons = "; ".join(reason.text for reason in result.verdict.reasons)
         text = reasons or f"A window of {result.pairs} pairs was accepted."
         entry = self._entry("estimate", result.verdict.decision, text, result.data_stamp_ns)
         self.history.append(entry.model_copy(update={"window_id": result.window_id}), result)
 
-    def note_check(self, check: CheckReply) -> None:
+    def note_check(self, check: replies.CheckReply) -> None:
         """The monitor made a check."""
         values = {name: metric.value for name, metric in check.metrics.items()}
-        self.incidents.note(MetricsPoint(stamp_ns=check.stamp_ns, state=check.state, metrics=values))
+        self.incidents.note(replies.MetricsPoint(stamp_ns=check.stamp_ns, state=check.state, metrics=values))
         self._checks.append(check)
         self._disk_writer.write(self._checks, self.incidents)
 
-    def checks(self) -> tuple[CheckReply, ...]:
+    def checks(self) -> tuple[replies.CheckReply, ...]:
         """All checks that are kept, oldest first."""
         return self._checks.checks()
 
@@ -250,7 +242,7 @@ class PairStore:
         self._commissioned_from = window_ids
         self.protect()
 
-    def served_before(self, name: str | None) -> tuple[HistoryRecord, CalibrationResult]:
+    def served_before(self, name: str | None) -> tuple[HistoryRecord, replies.CalibrationResult]:
         """A calibration that was served, as the history holds it, and the accepted result on which it rested.
 
         Args:
@@ -262,7 +254,7 @@ class PairStore:
             NotFoundError: no calibration has this name, or the name is ambiguous.
         """
         served = transform_of(self._state.T_camera_lidar).matrix
-        results: dict[str, CalibrationResult] = {}
+        results: dict[str, replies.CalibrationResult] = {}
         matches: dict[str, HistoryRecord] = {}
         in_force: HistoryRecord | None = None
         requested_by_window: str | None = None
@@ -324,9 +316,9 @@ class PairStore:
     def _durable_heads(self) -> Mapping[str, str]:
         return self.history.durable_heads
 
-    def _entry(self, kind: EntryKind, code: str, text: str, stamp_ns: int | None = None) -> HistoryEntry:
+    def _entry(self, kind: EntryKind, code: str, text: str, stamp_ns: int | None = None) -> replies.HistoryEntry:
         """An entry dated now; its place in the chain is filled in when it is appended."""
-        return HistoryEntry(
+        return replies.HistoryEntry(
             sequence=0,
             previous_sha256=GENESIS,
             kind=kind,
@@ -404,7 +396,7 @@ class PairStore:
             and self._folder.path(result.window_id).exists()
         ]
         self.incidents.begin(
-            EvidenceEvent(
+            replies.EvidenceEvent(
                 event_id=f"{self._rig.pair}-{at_ns}",
                 vehicle=self._vehicle,
                 pair=self._rig.pair,
@@ -432,7 +424,7 @@ class PairStore:
     def protect(self) -> None:
         """Protects in the window folder the windows that are evidence, and those from which the rig was
         commissioned."""
-        protected: dict[str, RetentionReason] = dict.fromkeys(self._commissioned_from, "commissioning")
+        protected: dict[str, replies.RetentionReason] = dict.fromkeys(self._commissioned_from, "commissioning")
         protected |= dict.fromkeys(self.incidents.window_ids, "red_event")
         self._folder.protect(self._rig.pair, protected)
 

@@ -31,7 +31,7 @@ from coec.calibration.types import Estimate, Matrix4, Reason, Rig, Uncertainty
 from coec.config import CalibrationConfig, PairConfig, StateConfig
 from coec.errors import StateError
 from coec.geometry import se3
-from coec.io.baseline_file import BASELINES, baseline_of_rig, load_baseline, save_baseline
+from coec.io.rig_files import BASELINES, baseline_of_rig, load_baseline, save_baseline
 from coec.io.storage import StateFile
 from coec.schemas.message import Part
 from coec.schemas.replies import Maybe6x6, Row4, Vector6

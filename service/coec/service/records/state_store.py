@@ -23,35 +23,13 @@ from cattrs import ClassValidationError, Converter
 from cattrs.gen import override
 from pydantic import ValidationError
 
+from coec.calibration import state as lifecycle
 from coec.calibration.monitor.change_detector import ACCUSING, MonitorOutcome, MonitorState
-from coec.calibration.state import (
-    LAST_KNOWN,
-    CalibrationStatus,
-    ExtrinsicHold,
-    PairState,
-    PendingEstimate,
-    Provenance,
-    initial_state,
-)
 from coec.calibration.state_machine import AlarmRecord, HealthState
 from coec.calibration.tracker import PosePosterior, Track
 from coec.calibration.types import Decision, Estimate, Matrix4, Reason, Rig
 from coec.errors import NotFoundError, StateError
-from coec.io.converter import (
-    POSE,
-    MalformedValueError,
-    NotRigidError,
-    array,
-    arrays,
-    bounded,
-    flag,
-    make_converter,
-    read_pose,
-    register,
-    structured,
-    text,
-    whole_number,
-)
+from coec.io import converter
 from coec.io.rig_files import identity_sha256, is_same_rig, rig_identity
 from coec.io.serialise import estimate_of, result_of
 from coec.io.storage import BROKEN, NEWER, OLDER, StateFile
@@ -62,7 +40,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StoredPair(PairState):
+class StoredPair(lifecycle.PairState):
     """`PairState` on the disk. Beside it: the versions of its parts, the rig that it belongs to, when (wall clock) a
     check was last completed, since when the pair is in its state of health, and the heads of its history on the disk.
 
@@ -71,8 +49,8 @@ class StoredPair(PairState):
     """
 
     T_camera_lidar: Matrix4 = field(default_factory=lambda: np.eye(4))
-    provenance: Provenance = Provenance.RESTORED
-    status: CalibrationStatus = CalibrationStatus.NOT_ACCEPTED
+    provenance: lifecycle.Provenance = lifecycle.Provenance.RESTORED
+    status: lifecycle.CalibrationStatus = lifecycle.CalibrationStatus.NOT_ACCEPTED
     valid_from_ns: int = 0
     reasons: tuple[Reason, ...] = ()
     versions: dict[str, int] = field(default_factory=dict)
@@ -167,7 +145,7 @@ class Clocks:
 class RestoredPair:
     """A pair as it was before the restart, the windows that it was commissioned from, and the parts that were lost."""
 
-    state: PairState
+    state: lifecycle.PairState
     clocks: Clocks
     history_heads: Mapping[str, str]
     commissioned_from: tuple[str, ...]
@@ -175,7 +153,7 @@ class RestoredPair:
 
 
 def pair_to_json(
-    rig: Rig, vehicle: str, state: PairState, clocks: Clocks, commissioned_from: tuple[str, ...]
+    rig: Rig, vehicle: str, state: lifecycle.PairState, clocks: Clocks, commissioned_from: tuple[str, ...]
 ) -> dict[str, Any]:
     """The state as JSON values, without the heads of the history."""
     identity = rig_identity(rig)
@@ -195,7 +173,7 @@ def pair_to_json(
     return document
 
 
-def _fields_of(value: PairState | Clocks) -> dict[str, Any]:
+def _fields_of(value: lifecycle.PairState | Clocks) -> dict[str, Any]:
     """The fields of a dataclass by name."""
     return {one.name: getattr(value, one.name) for one in fields(value)}
 
@@ -212,25 +190,36 @@ class _BeyondMeasureError(ValueError):
 def _state_form() -> Converter:
     """The rules by which a `StoredPair` is written and read. Of an estimate the wire's model is written, which names
     the rig and the vehicle, too; see `pair_to_json`."""
-    form = make_converter()
+    form = converter.make_converter()
     form.register_structure_hook(Estimate, _read_estimate)
     form.register_unstructure_hook(Estimate, lambda estimate: estimate)
-    untrusted = override(struct_hook=lambda value, _: Untrusted(text(value)))
-    register(form, Reason, code=untrusted, text=untrusted)
-    register(form, PendingEstimate, T_camera_lidar=POSE, estimate=override(rename="result"))
-    observed = array(6, of=flag)
-    register(form, PosePosterior, T_camera_lidar=POSE, covariance=array(6, 6), systematic=arrays(6), observed=observed)
-    register(form, Track, required=[one.name for one in fields(Track)], prior_sigma=array(6))
-    count = bounded(whole_number, lambda value: value >= 0, "a count")
-    register(form, AlarmRecord, watched_ns=count, confirmed=count, withdrawn=count)
+    untrusted = override(struct_hook=lambda value, _: Untrusted(converter.text(value)))
+    converter.register(form, Reason, code=untrusted, text=untrusted)
+    converter.register(
+        form, lifecycle.PendingEstimate, T_camera_lidar=converter.POSE, estimate=override(rename="result")
+    )
+    observed = converter.array(6, of=converter.flag)
+    converter.register(
+        form,
+        PosePosterior,
+        T_camera_lidar=converter.POSE,
+        covariance=converter.array(6, 6),
+        systematic=converter.arrays(6),
+        observed=observed,
+    )
+    converter.register(form, Track, required=[one.name for one in fields(Track)], prior_sigma=converter.array(6))
+    count = converter.bounded(converter.whole_number, lambda value: value >= 0, "a count")
+    converter.register(form, AlarmRecord, watched_ns=count, confirmed=count, withdrawn=count)
     # Nanoseconds since 1970, as the clocks of Linux count them.
-    wall_ns = bounded(
-        lambda value: None if value is None else whole_number(value),
+    wall_ns = converter.bounded(
+        lambda value: None if value is None else converter.whole_number(value),
         lambda value: value is None or 0 <= value < 2**63,
         "a time since 1970",
     )
-    register(form, ExtrinsicHold, since_ns=wall_ns)
-    register(form, StoredPair, T_camera_lidar=POSE, completed_wall_ns=wall_ns, since_wall_ns=wall_ns)
+    converter.register(form, lifecycle.ExtrinsicHold, since_ns=wall_ns)
+    converter.register(
+        form, StoredPair, T_camera_lidar=converter.POSE, completed_wall_ns=wall_ns, since_wall_ns=wall_ns
+    )
     return form
 
 
@@ -238,7 +227,7 @@ def _read_estimate(value: Any, _: object) -> Estimate:
     result = CalibrationResult.model_validate(value)
     moved = () if result.moved is None else (result.moved.before, result.moved.after)
     for transform in (result.camera_from_lidar, *moved):
-        read_pose(transform.matrix)
+        converter.read_pose(transform.matrix)
     estimate = estimate_of(result)
     if (estimate.uncertainty.noise.diagonal() < 0.0).any():
         raise _BeyondMeasureError("a variance is negative")
@@ -255,7 +244,7 @@ class AnotherRigError(StateError):
     """The state belongs to another rig."""
 
 
-def pair_from_json(document: Mapping[str, Any], rig: Rig | None, nominal: PairState) -> RestoredPair:
+def pair_from_json(document: Mapping[str, Any], rig: Rig | None, nominal: lifecycle.PairState) -> RestoredPair:
     """The state that this version or another one wrote, as far as it can be read.
 
     Args:
@@ -273,7 +262,7 @@ def pair_from_json(document: Mapping[str, Any], rig: Rig | None, nominal: PairSt
 class _Reader:
     """Reads the parts of one document, each by itself, and notes which are lost."""
 
-    def __init__(self, document: Mapping[str, Any], nominal: PairState) -> None:
+    def __init__(self, document: Mapping[str, Any], nominal: lifecycle.PairState) -> None:
         self._document = document
         self._nominal = nominal
         versions = document.get("versions")
@@ -338,11 +327,13 @@ class _Reader:
     def restored(self) -> RestoredPair:
         """The state, as far as it can be read."""
         stored = self._stored
-        state = PairState(**{one.name: getattr(stored, one.name) for one in fields(PairState)})
+        state = lifecycle.PairState(**{one.name: getattr(stored, one.name) for one in fields(lifecycle.PairState)})
         state = replace(self._with_calibration(state), hold=self._hold())
         if "status" in self._unreadable and state.latest is not None:
             accepted = state.latest.verdict.decision is Decision.ACCEPTED
-            state = replace(state, status=CalibrationStatus.ACCEPTED if accepted else CalibrationStatus.FAILED)
+            state = replace(
+                state, status=lifecycle.CalibrationStatus.ACCEPTED if accepted else lifecycle.CalibrationStatus.FAILED
+            )
         state = self._with_health(state)
         if "monitor" in self._lost and (state.seen in _RED or state.monitor.outcome in ACCUSING):
             # A monitor that has forgotten what it had against the extrinsic may not acquit it: only a window may.
@@ -354,7 +345,7 @@ class _Reader:
         heads = {"results": str(head)} if is_alone else stored.history_heads
         return RestoredPair(state, clocks, heads, stored.commissioned_from, tuple(self._lost.values()))
 
-    def _with_calibration(self, state: PairState) -> PairState:
+    def _with_calibration(self, state: lifecycle.PairState) -> lifecycle.PairState:
         """What is served, and all that refers to it."""
         if self._document.get("T_camera_lidar") is None:
             self._lose("extrinsic")
@@ -385,27 +376,27 @@ class _Reader:
             return left
         for name in document.keys() & {"outcome", "blind", "dirt", "vouched", "doubtful"}:
             try:
-                read = structured(STATE_FORM, {name: document[name]}, MonitorState)
-            except MalformedValueError:
+                read = converter.structured(STATE_FORM, {name: document[name]}, MonitorState)
+            except converter.MalformedValueError:
                 continue
             left = replace(left, **{name: getattr(read, name)})
         return left if left.outcome in ACCUSING else replace(left, outcome=MonitorOutcome.UNKNOWN)
 
-    def _hold(self) -> ExtrinsicHold | None:
+    def _hold(self) -> lifecycle.ExtrinsicHold | None:
         """The hold on the extrinsic; None if there is none. The earliest versions do not say who holds it. Who releases
         what somebody may have held cannot take it back."""
         stored, unreadable = self._stored, self._unreadable
         is_held = stored.frozen if "frozen" not in unreadable else self._document.get("frozen") is not False
-        return (stored.hold or ExtrinsicHold()) if is_held else None
+        return (stored.hold or lifecycle.ExtrinsicHold()) if is_held else None
 
-    def _with_health(self, state: PairState) -> PairState:
+    def _with_health(self, state: lifecycle.PairState) -> lifecycle.PairState:
         """The state with its health: as it was, or with less confidence if a part of the state is lost."""
         unreadable, health, reasons = self._unreadable, state.health, state.reasons
         if unreadable.intersection(("health", "unseen_from")) and health not in _RED:
             health = self._at_best(state, health)
         if unreadable.intersection(("health", "reasons")):
-            text = f"Last known: {health.value}. The reasons could not be read from the state."
-            reasons = (Reason(LAST_KNOWN, text),)
+            why = f"Last known: {health.value}. The reasons could not be read from the state."
+            reasons = (Reason(lifecycle.LAST_KNOWN, why),)
         if self._lost and health is HealthState.HEALTHY:
             health = HealthState.UNKNOWN
         unseen_from = state.unseen_from
@@ -418,7 +409,7 @@ class _Reader:
             state, health=health, reasons=reasons, unseen_from=unseen_from, flagged_since_ns=flagged_since_ns
         )
 
-    def _at_best(self, state: PairState, health: HealthState) -> HealthState:
+    def _at_best(self, state: lifecycle.PairState, health: HealthState) -> HealthState:
         """The health that the other parts of the state allow at best, where the health itself is lost."""
         if state.monitor.outcome is MonitorOutcome.CONFIRMED:
             return HealthState.MISCALIBRATED
@@ -435,7 +426,7 @@ def _implausible(error: BaseException) -> str | None:
     """Why a value of the right form is none that this service wrote; None if its form is wrong."""
     if isinstance(error, BaseExceptionGroup):
         return next((why for one in error.exceptions if (why := _implausible(one))), None)
-    if isinstance(error, NotRigidError):
+    if isinstance(error, converter.NotRigidError):
         return "a pose in it is no rigid transform"
     return str(error) if isinstance(error, _BeyondMeasureError) else None
 
@@ -478,7 +469,7 @@ class StateStore:
             self._file.reject()
             raise StateError(f"the state of pair {rig.pair} is no JSON object")
         try:
-            remembered = pair_from_json(document, rig, initial_state(rig))
+            remembered = pair_from_json(document, rig, lifecycle.initial_state(rig))
         except AnotherRigError:
             _log.warning(
                 "the state on the disk belongs to another rig: starting from nominal",
@@ -491,14 +482,14 @@ class StateStore:
             _log.warning("a part of the state on the disk cannot be read", extra={"fields": fields})
         if document.keys() - FIELDS - OF_FIRST_VERSIONS:
             self._file.reject(NEWER)
-            text = "a newer version wrote fields of the state that this one does not know: the file is kept aside"
-            _log.info(text, extra={"fields": {"pair": rig.pair}})
+            message = "a newer version wrote fields of the state that this one does not know: the file is kept aside"
+            _log.info(message, extra={"fields": {"pair": rig.pair}})
         return remembered
 
     def update(
         self,
         rig: Rig,
-        state: PairState,
+        state: lifecycle.PairState,
         clocks: Clocks,
         history_heads: Callable[[], Mapping[str, str]],
         commissioned_from: tuple[str, ...] = (),
@@ -524,7 +515,7 @@ class StateStore:
             self._file.save({"pairs": {**pairs, **updated}})
 
 
-def read_pairs(folder: Path) -> dict[str, tuple[CalibrationResult | None, PairState]]:
+def read_pairs(folder: Path) -> dict[str, tuple[CalibrationResult | None, lifecycle.PairState]]:
     """What a state directory holds of every pair whose extrinsic can be read, for programs that read it beside the
     service or without one: the accepted result and the state. Other parts that cannot be read have their defaults, as
     in the service.
@@ -539,13 +530,15 @@ def read_pairs(folder: Path) -> dict[str, tuple[CalibrationResult | None, PairSt
             raise StateError(f"{folder / STATE_FILE} cannot be used: {'; '.join(loaded.damage)}")
         raise NotFoundError(f"{folder} holds no {STATE_FILE}")
     documents = loaded.body.get("pairs")
-    readable: dict[str, tuple[CalibrationResult | None, PairState]] = {}
+    readable: dict[str, tuple[CalibrationResult | None, lifecycle.PairState]] = {}
     refused = [] if isinstance(documents, dict) else ["it lists no pairs"]
     for name, document in (documents if isinstance(documents, dict) else {}).items():
         if not isinstance(document, dict):
             refused.append(f"pair {name} is no JSON object")
             continue
-        unknown = PairState(np.eye(4), Provenance.NOMINAL, CalibrationStatus.NOT_ACCEPTED, 0)
+        unknown = lifecycle.PairState(
+            np.eye(4), lifecycle.Provenance.NOMINAL, lifecycle.CalibrationStatus.NOT_ACCEPTED, 0
+        )
         remembered = pair_from_json(document, None, unknown)
         extrinsic = [lost.why for lost in remembered.lost if lost.part == "extrinsic"]
         if extrinsic:

@@ -222,7 +222,7 @@ class Child:
         if (exit_text := self._exit_text()) is not None:
             raise ChildError(Fault.DIED, exit_text)
         self._read_processor_time()
-        resident, allowed = self._resident_bytes(), self._config.max_memory_bytes
+        resident, allowed = resident_bytes(self.pid), self._config.max_memory_bytes
         if resident > allowed:
             text = f"used {resident >> 20} MiB of memory; worker.max_memory_bytes allows {allowed >> 20} MiB"
             raise ChildError(Fault.TOO_LARGE, text)
@@ -293,10 +293,6 @@ class Child:
         except subprocess.TimeoutExpired:
             return None
         return f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
-
-    def _resident_bytes(self) -> int:
-        """Resident memory of the process, bytes; 0 if it is gone."""
-        return resident_bytes(self.pid)
 
 
 def _environment(threads: int) -> dict[str, str]:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from coec.calibration import types
 from coec.calibration.baseline import Baseline, learned_hash, mismatch
 from coec.calibration.commissioning import MAX_PAIRS, commission_in_steps
 from coec.calibration.frames.motion_compensation import compensate
@@ -19,51 +20,20 @@ from coec.calibration.monitor.check_verdict import observe
 from coec.calibration.pipeline import calibrate
 from coec.calibration.rig.lidar_registration import register
 from coec.calibration.rig.lidar_sampling import LidarRig, SweepPair
-from coec.calibration.types import (
-    Estimate,
-    FramePair,
-    LidarFrame,
-    Matrix4,
-    Reason,
-    Rig,
-    Silence,
-    Step,
-    Steps,
-    Window,
-)
 from coec.config import CalibrationConfig, Config, DepthConfig
 from coec.errors import CoecError, DecodeError, RecordingError, StateError, WindowError
 from coec.geometry.points import lengths
-from coec.io.baseline_file import BASELINES, baseline_of_rig, save_baseline
 from coec.io.converter import structured
 from coec.io.depth.depth_maps import CachedDepth, open_depth
 from coec.io.images import CachedGreys, GreyImages, RangeScale, decode_bgr, encode_jpeg, scale_of, stable_scale
 from coec.io.msgpack_frames import decode_camera
 from coec.io.nearest_neighbours import Trees, installed
-from coec.io.rig_files import rig_of
+from coec.io.rig_files import BASELINES, baseline_of_rig, rig_of, save_baseline
 from coec.reports.close_ups import Caption, close_ups
+from coec.reports.drawing import render_points, titled
 from coec.reports.formatting import instant
-from coec.reports.overlay import render_points, titled
 from coec.service.worker import worker_jobs
 from coec.service.worker.warm_up import invented_window, warm_up_check, warm_up_solve
-from coec.service.worker.worker_jobs import (
-    DEADLINE_S,
-    Answer,
-    Checked,
-    Commissioned,
-    Kind,
-    Registered,
-    RenderedImage,
-    Solved,
-    Underway,
-    WrittenFile,
-    pack_answer,
-    pack_refusal,
-    pack_underway,
-    unpack_pairs,
-    unpack_sweeps,
-    wire_form,
-)
 
 _log = logging.getLogger(__name__)
 
@@ -79,7 +49,7 @@ class _Commissioning:
     """A commissioning that was begun: its number, its remaining steps, and when it was begun (steady clock, s)."""
 
     run: int
-    steps: Steps[Baseline]
+    steps: types.Steps[Baseline]
     started_s: float
 
 
@@ -142,7 +112,7 @@ class Solver:
             self._warm_up_lidars()
             yield
 
-    def _alike(self) -> list[tuple[Rig, CalibrationConfig]]:
+    def _alike(self) -> list[tuple[types.Rig, CalibrationConfig]]:
         """One rig and its configuration of each kind that kernels can tell apart."""
         alike = {
             (type(rig.camera), rig.sweep is None, pair.calibration): (rig, pair.calibration)
@@ -166,18 +136,17 @@ class Solver:
         """
         self._network(self._pairs[pair].calibration.depth).infer(decode_camera(frame, self._config.limits))
 
-    def solve(self, path: Path) -> Solved:
+    def solve(self, path: Path) -> worker_jobs.Solved:
         """Calibrates a finished window by the configuration in its file, and writes the result into the file.
 
         Raises:
             WindowError, CalibrationError, DecodeError, ModelError: there is no result.
         """
-        from coec.io.mcap.window_reader import read_window
-        from coec.io.mcap.window_writer import write_result
+        from coec.io.mcap.windows import read_window, write_result
         from coec.io.serialise import result_of
 
         window, configuration = read_window(path)
-        estimate = calibrate(window, self._network(configuration.depth), self._images, configuration, Silence())
+        estimate = calibrate(window, self._network(configuration.depth), self._images, configuration, types.Silence())
         result = result_of(estimate, window.rig, self._config.vehicle)
         picture = self._picture_of_result(window, configuration, estimate)
         try:
@@ -185,10 +154,14 @@ class Solver:
         except (RecordingError, WindowError, OSError) as error:
             _log.warning("the result could not be written into its window", extra={"fields": {"window": path.stem}})
             code = error.reply_code if isinstance(error, CoecError) else "recording_failed"
-            return Solved(result, Reason(code, f"The window file does not hold the result: {error}"))
-        return Solved(result, None, WrittenFile(file.bytes, file.modified_ns, file.sha256, file.pairs))
+            return worker_jobs.Solved(result, types.Reason(code, f"The window file does not hold the result: {error}"))
+        return worker_jobs.Solved(
+            result, None, worker_jobs.WrittenFile(file.bytes, file.modified_ns, file.sha256, file.pairs)
+        )
 
-    def _picture_of_result(self, window: Window, configuration: CalibrationConfig, estimate: Estimate) -> bytes | None:
+    def _picture_of_result(
+        self, window: types.Window, configuration: CalibrationConfig, estimate: types.Estimate
+    ) -> bytes | None:
         """JPEG of the window's last pair at its result; None if it cannot be drawn, because a result needs no
         picture."""
         title = f"{window.window_id}  {estimate.verdict.decision.value}"
@@ -205,42 +178,44 @@ class Solver:
         configuration: CalibrationConfig,
         pose: Sequence[Sequence[float]],
         frames: Sequence[Sequence[bytes | None]],
-    ) -> Checked:
+    ) -> worker_jobs.Checked:
         """Makes a check of the monitor at an extrinsic (rows of the (4, 4) matrix), with the pairs as `messages` packs
         them.
 
         Raises:
             CalibrationError, DecodeError, ModelError: there is no answer.
         """
-        window = Window(
+        window = types.Window(
             f"{pair}-check",
             self._rigs[pair],
             np.array(pose, dtype=np.float64),
-            unpack_pairs(frames, self._config.limits),
+            worker_jobs.unpack_pairs(frames, self._config.limits),
         )
         network = self._network(configuration.depth)
         baseline, not_used = self._baseline(pair, configuration, network.identity)
         images = CachedGreys(self._images, len(window.pairs))
-        return Checked(observe(window, network, images, configuration, baseline), not_used)
+        return worker_jobs.Checked(observe(window, network, images, configuration, baseline), not_used)
 
-    def overlay(self, path: Path, pose: Sequence[Sequence[float]], title: str) -> RenderedImage:
+    def overlay(self, path: Path, pose: Sequence[Sequence[float]], title: str) -> worker_jobs.RenderedImage:
         """JPEG of a window's last pair, with its points drawn on its image at an extrinsic (rows of the (4, 4) matrix).
 
         Raises:
             WindowError, DecodeError: the window or its image cannot be read.
         """
-        from coec.io.mcap.window_reader import read_window
+        from coec.io.mcap.windows import read_window
 
         window, configuration = read_window(path)
         return self._render(window.rig, configuration, pose, window.pairs[-1], title)
 
-    def comparison(self, path: Path, poses: Sequence[Sequence[Sequence[float]]], names: Sequence[str]) -> RenderedImage:
+    def comparison(
+        self, path: Path, poses: Sequence[Sequence[Sequence[float]]], names: Sequence[str]
+    ) -> worker_jobs.RenderedImage:
         """JPEG of two extrinsics (rows of the (4, 4) matrices) side by side on a window, where they differ most.
 
         Raises:
             WindowError, DecodeError, CalibrationError: the window or an image of it cannot be used.
         """
-        from coec.io.mcap.window_reader import read_window
+        from coec.io.mcap.windows import read_window
 
         window, configuration = read_window(path)
         before, after = (np.array(pose, dtype=np.float64) for pose in poses)
@@ -252,7 +227,7 @@ class Solver:
             caption=Caption(before=names[0], after=names[1]),
             limits=self._config.limits,
         )
-        return RenderedImage(encode_jpeg(picture, OVERLAY_JPEG_QUALITY))
+        return worker_jobs.RenderedImage(encode_jpeg(picture, OVERLAY_JPEG_QUALITY))
 
     def picture(
         self,
@@ -261,20 +236,20 @@ class Solver:
         pose: Sequence[Sequence[float]],
         frames: Sequence[Sequence[bytes | None]],
         title: str,
-    ) -> RenderedImage:
+    ) -> worker_jobs.RenderedImage:
         """JPEG of one pair of the stream at an extrinsic, like `overlay`; the pair is packed as `messages` does.
 
         Raises:
             DecodeError: a frame cannot be decoded.
         """
-        (frame_pair,) = unpack_pairs(frames, self._config.limits)
+        (frame_pair,) = worker_jobs.unpack_pairs(frames, self._config.limits)
         return self._render(
             self._rigs[pair], configuration, pose, frame_pair, title, self._scale(pair, frame_pair.lidar)
         )
 
     def commission(
         self, run: int, configuration: CalibrationConfig, pose: Sequence[Sequence[float]], paths: Sequence[Path]
-    ) -> Commissioned | Underway:
+    ) -> worker_jobs.Commissioned | worker_jobs.Underway:
         """Does the next slice of a commissioning: learns the baseline of a rig at an extrinsic (rows of the (4, 4)
         matrix) from recorded windows, and writes it at the end. Begins anew if `run`, the number of the commissioning,
         is not that of the one that was begun; an earlier one is given up.
@@ -295,19 +270,22 @@ class Solver:
             baseline: Baseline = end.value
         else:
             self._commissioning = current
-            return Underway(step.stage, step.done, step.total)
+            return worker_jobs.Underway(step.stage, step.done, step.total)
         saved = save_baseline(self._config.state.directory / BASELINES, baseline)
-        return Commissioned(baseline.T_camera_lidar, saved, baseline.windows, baseline.pairs)
+        return worker_jobs.Commissioned(baseline.T_camera_lidar, saved, baseline.windows, baseline.pairs)
 
     def forget_abandoned(self) -> None:
         """Frees the memory of a commissioning that was begun so long ago that its job has been given up."""
         current = self._commissioning
-        if current is not None and time.monotonic() - current.started_s > DEADLINE_S[Kind.COMMISSION]:
+        if (
+            current is not None
+            and time.monotonic() - current.started_s > worker_jobs.DEADLINE_S[worker_jobs.Kind.COMMISSION]
+        ):
             self._commissioning = None
 
     def _commissioning_steps(
-        self, configuration: CalibrationConfig, reference: Matrix4, paths: Sequence[Path]
-    ) -> Steps[Baseline]:
+        self, configuration: CalibrationConfig, reference: types.Matrix4, paths: Sequence[Path]
+    ) -> types.Steps[Baseline]:
         # A cache of its own, because checks in between would push the maps out of the common one.
         depth = CachedDepth(self._network(configuration.depth), MAX_PAIRS)
         windows = self._windows_of(paths, reference)
@@ -318,43 +296,45 @@ class Solver:
         )
 
     @staticmethod
-    def _windows_of(paths: Sequence[Path], T_camera_lidar_start: Matrix4) -> Steps[list[Window]]:
-        from coec.io.mcap.window_reader import read_window
+    def _windows_of(paths: Sequence[Path], T_camera_lidar_start: types.Matrix4) -> types.Steps[list[types.Window]]:
+        from coec.io.mcap.windows import read_window
 
         windows = []
         for number, path in enumerate(paths, start=1):
             windows.append(replace(read_window(path)[0], T_camera_lidar_start=T_camera_lidar_start))
-            yield Step("windows", number, len(paths))
+            yield types.Step("windows", number, len(paths))
         return windows
 
-    def register(self, lidars: Mapping[str, Any], frames: Sequence[Sequence[bytes | None]]) -> Registered:
+    def register(self, lidars: Mapping[str, Any], frames: Sequence[Sequence[bytes | None]]) -> worker_jobs.Registered:
         """Finds the pose of one LiDAR in another; both, and pairs of their sweeps, are packed as `messages` does.
 
         Raises:
             SourceError: the optional extra is not installed.
             DecodeError: a frame cannot be decoded.
         """
-        rig = structured(wire_form(), lidars, LidarRig)
-        edge = register(rig, unpack_sweeps(frames, self._config.limits), Trees())
-        return Registered(**{field.name: getattr(edge, field.name) for field in fields(Registered)})
+        rig = structured(worker_jobs.wire_form(), lidars, LidarRig)
+        edge = register(rig, worker_jobs.unpack_sweeps(frames, self._config.limits), Trees())
+        return worker_jobs.Registered(
+            **{field.name: getattr(edge, field.name) for field in fields(worker_jobs.Registered)}
+        )
 
     def _render(
         self,
-        rig: Rig,
+        rig: types.Rig,
         configuration: CalibrationConfig,
         pose: Sequence[Sequence[float]],
-        pair: FramePair,
+        pair: types.FramePair,
         title: str,
         scale: RangeScale | None = None,
-    ) -> RenderedImage:
+    ) -> worker_jobs.RenderedImage:
         xyz_m = compensate(pair, rig, enabled=configuration.motion_compensation)
         image = decode_bgr(pair.camera.image, self._config.limits)
         T_camera_lidar = np.array(pose, dtype=np.float64)
         caption = f"{title}\n{instant(pair.camera.stamp_ns)}"
         picture = render_points(image, rig.camera, T_camera_lidar, xyz_m, rig.mask, scale)
-        return RenderedImage(encode_jpeg(titled(picture, caption), OVERLAY_JPEG_QUALITY))
+        return worker_jobs.RenderedImage(encode_jpeg(titled(picture, caption), OVERLAY_JPEG_QUALITY))
 
-    def _scale(self, pair: str, sweep: LidarFrame) -> RangeScale:
+    def _scale(self, pair: str, sweep: types.LidarFrame) -> RangeScale:
         """The colour scale of a stream, which stays the same from picture to picture."""
         scale = stable_scale(self._scales.get(pair), scale_of(lengths(sweep.xyz_m)))
         self._scales[pair] = scale
@@ -389,15 +369,19 @@ def answer_request(solver: Solver, message: dict[str, Any]) -> dict[str, Any]:
     process ends; the service replaces it and tries again, a limited number of times."""
     number = message["id"]
     try:
-        end = solver.solve(Path(message["path"])) if message["kind"] == Kind.SOLVE else _answer_once(solver, message)
+        end = (
+            solver.solve(Path(message["path"]))
+            if message["kind"] == worker_jobs.Kind.SOLVE
+            else _answer_once(solver, message)
+        )
     except CoecError as error:
-        end = Reason(error.reply_code, str(error))
-    if isinstance(end, Reason):
-        return pack_refusal(number, end)
-    return pack_underway(number, end) if isinstance(end, Underway) else pack_answer(number, end)
+        end = types.Reason(error.reply_code, str(error))
+    return worker_jobs.pack_answer(number, end)
 
 
-def _answer_once(solver: Solver, message: dict[str, Any]) -> Answer | Underway | Reason | None:
+def _answer_once(
+    solver: Solver, message: dict[str, Any]
+) -> worker_jobs.Answer | worker_jobs.Underway | types.Reason | None:
     """The answer to work that is tried only once. A fault of the program is an answer, too, because checks come every
     few seconds: if each of them ended the worker, it would solve no more windows.
 
@@ -407,20 +391,20 @@ def _answer_once(solver: Solver, message: dict[str, Any]) -> Answer | Underway |
     """
     try:
         match message["kind"]:
-            case Kind.CHECK:
+            case worker_jobs.Kind.CHECK:
                 return solver.observe(message["pair"], _configuration(message), message["pose"], message["frames"])
-            case Kind.OVERLAY if "poses" in message:
+            case worker_jobs.Kind.OVERLAY if "poses" in message:
                 return solver.comparison(Path(message["path"]), message["poses"], message["names"])
-            case Kind.OVERLAY:
+            case worker_jobs.Kind.OVERLAY:
                 return solver.overlay(Path(message["path"]), message["pose"], message["title"])
-            case Kind.PICTURE:
+            case worker_jobs.Kind.PICTURE:
                 return solver.picture(
                     message["pair"], _configuration(message), message["pose"], message["frames"], message["title"]
                 )
-            case Kind.COMMISSION:
+            case worker_jobs.Kind.COMMISSION:
                 paths = [Path(path) for path in message["paths"]]
                 return solver.commission(message["run"], _configuration(message), message["pose"], paths)
-            case Kind.REGISTER:
+            case worker_jobs.Kind.REGISTER:
                 return solver.register(message["lidars"], message["frames"])
             case worker_jobs.PREFETCH:
                 solver.prefetch(message["pair"], message["frame"])
@@ -431,7 +415,7 @@ def _answer_once(solver: Solver, message: dict[str, Any]) -> Answer | Underway |
     except Exception as error:
         _log.exception("the work failed", extra={"fields": {"kind": message["kind"], "pair": message.get("pair")}})
         text = f"The program failed ({type(error).__name__}: {error}); the log has the traceback."
-        return Reason(INTERNAL_ERROR, text)
+        return types.Reason(INTERNAL_ERROR, text)
 
 
 def _configuration(message: dict[str, Any]) -> CalibrationConfig:

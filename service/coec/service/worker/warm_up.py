@@ -9,22 +9,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from coec.calibration import types
 from coec.calibration.monitor.check_verdict import MIN_PAIRS, diagnose
 from coec.calibration.objective.mutual_information import SearchBox
 from coec.calibration.pipeline import calibrate
 from coec.calibration.search.global_search import sample_reach
-from coec.calibration.types import (
-    CameraFrame,
-    DepthMap,
-    EgoMotion,
-    EncodedImage,
-    FramePair,
-    ImageFormat,
-    LidarFrame,
-    Rig,
-    Silence,
-    Window,
-)
 from coec.config import CalibrationConfig
 from coec.errors import CalibrationError, DecodeError
 from coec.geometry.cameras import Camera, scaled
@@ -105,21 +94,21 @@ EVALUATIONS, REACH_DEG = 4, 4.0
 """Limits of the searches of the warm-up."""
 
 
-def warm_up_check(rig: Rig, calibration: CalibrationConfig, images: GreyImages) -> None:
+def warm_up_check(rig: types.Rig, calibration: CalibrationConfig, images: GreyImages) -> None:
     """Runs the kernels that a check of one pair uses."""
     rig = small(rig)
     with contextlib.suppress(CalibrationError, DecodeError):
         diagnose(invented_window(rig), _Ramp(), images, _short(calibration), None)
 
 
-def warm_up_solve(rig: Rig, calibration: CalibrationConfig, images: GreyImages) -> Iterator[None]:
+def warm_up_solve(rig: types.Rig, calibration: CalibrationConfig, images: GreyImages) -> Iterator[None]:
     """Runs the kernels that the solve of a window of one pair uses, a few seconds of compiling in each step."""
     rig = small(rig)
     for run in reversed(late_kernels(rig.camera)):
         run()
         yield
     with contextlib.suppress(CalibrationError, DecodeError):
-        calibrate(invented_window(rig), _Ramp(), images, _short(calibration), Silence())
+        calibrate(invented_window(rig), _Ramp(), images, _short(calibration), types.Silence())
     # These two kernels compute the uncertainty of a result, and an invented window need not give a result.
     project(rig.camera, np.ones((1, 3)))
     alignment.alignment_of_parts(one_edge(rig.camera), np.zeros(1, np.uint8), 1, np.eye(4)[None])
@@ -138,13 +127,13 @@ class _Ramp:
     def identity(self) -> str:
         return "warm-up"
 
-    def infer(self, frame: CameraFrame) -> DepthMap:
+    def infer(self, frame: types.CameraFrame) -> types.DepthMap:
         del frame
         height, width = DEPTH_PX
-        return DepthMap(np.tile(np.linspace(1.0, 2.0, width, dtype=np.float32), (height, 1)))
+        return types.DepthMap(np.tile(np.linspace(1.0, 2.0, width, dtype=np.float32), (height, 1)))
 
 
-def small(rig: Rig) -> Rig:
+def small(rig: types.Rig) -> types.Rig:
     """The rig with a camera of fewer pixels and the same field of view. One corner is masked, so that code for the
     borders of masks runs, too."""
     scale = min(1.0, CAMERA_PX / max(rig.camera.width, rig.camera.height))
@@ -154,7 +143,7 @@ def small(rig: Rig) -> Rig:
     return replace(rig, camera=camera, mask=mask)
 
 
-def invented_window(rig: Rig) -> Window:
+def invented_window(rig: types.Rig) -> types.Window:
     """A window with random points all around the LiDAR, from a fixed seed. Its arrays are like those of a window from
     the disk, so that the kernels are compiled for the same types: read-only sweeps, images from a decoder, motion to
     compensate."""
@@ -166,13 +155,13 @@ def invented_window(rig: Rig) -> Window:
     xyz_m.setflags(write=False)
     width, height = rig.camera.width, rig.camera.height
     jpeg = encode_jpeg(rng.integers(0, 256, (height, width), np.uint8))
-    image = EncodedImage(ImageFormat.JPEG, width, height, jpeg)
+    image = types.EncodedImage(types.ImageFormat.JPEG, width, height, jpeg)
     pairs = tuple(
-        FramePair(
-            CameraFrame(stamp, rig.camera_frame, image),
-            LidarFrame(stamp, rig.lidar_frame, xyz_m, intensity=reflectance),
-            EgoMotion(stamp, "ego", (1.0, 0.0, 0.0), (0.0, 0.0, 0.1)),
+        types.FramePair(
+            types.CameraFrame(stamp, rig.camera_frame, image),
+            types.LidarFrame(stamp, rig.lidar_frame, xyz_m, intensity=reflectance),
+            types.EgoMotion(stamp, "ego", (1.0, 0.0, 0.0), (0.0, 0.0, 0.1)),
         )
         for stamp in range(0, MIN_PAIRS * 100_000_000, 100_000_000)
     )
-    return Window("warm-up", rig, rig.T_camera_lidar_nominal, pairs)
+    return types.Window("warm-up", rig, rig.T_camera_lidar_nominal, pairs)

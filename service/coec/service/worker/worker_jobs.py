@@ -36,7 +36,7 @@ from coec.config import CalibrationConfig, LimitsConfig
 from coec.geometry import se3
 from coec.io.converter import MalformedValueError, make_converter, structured
 from coec.io.converter import register as register_form
-from coec.io.msgpack_frames import decode_camera, decode_ego, decode_lidar, encode_camera, encode_ego, encode_lidar
+from coec.io.msgpack_frames import decode_camera, decode_ego, decode_lidar, encode
 from coec.schemas.message import from_msgpack, to_msgpack
 
 if TYPE_CHECKING:
@@ -69,10 +69,10 @@ class _PackedLazily(Sequence[list[bytes | None]]):
         if isinstance(index, slice):
             return _PackedLazily(self._pairs[index])
         pair = self._pairs[index]
-        motion = encode_ego(pair.motion) if pair.motion else None
+        motion = encode(pair.motion) if pair.motion else None
         if isinstance(pair, FramePair):
-            return [encode_camera(pair.camera), encode_lidar(pair.lidar), motion]
-        return [encode_lidar(pair.a), encode_lidar(pair.b), motion]
+            return [encode(pair.camera), encode(pair.lidar), motion]
+        return [encode(pair.a), encode(pair.b), motion]
 
 
 def unpack_pairs(frames: Sequence[Sequence[bytes | None]], limits: LimitsConfig) -> tuple[FramePair, ...]:
@@ -382,19 +382,11 @@ class MalformedAnswerError(Exception):
     """An answer is not of the documented form. The message says what is wrong, but quotes none of its values."""
 
 
-def pack_answer(number: int, answer: Answer | None) -> dict[str, Any]:
-    """The answer to the question of this number; None if the question asks for nothing."""
-    return {"id": number, "result": None if answer is None else wire_form().unstructure(answer)}
-
-
-def pack_refusal(number: int, reason: Reason) -> dict[str, Any]:
-    """The refusal of the question of this number, with its reason."""
-    return {"id": number, "refused": wire_form().unstructure(reason)}
-
-
-def pack_underway(number: int, underway: Underway) -> dict[str, Any]:
-    """The answer that the work of the question of this number is not complete."""
-    return {"id": number, "underway": wire_form().unstructure(underway)}
+def pack_answer(number: int, answer: Answer | Underway | Reason | None) -> dict[str, Any]:
+    """The answer to the question of this number: a result, how far the work is, or why it is refused; None if the
+    question asks for nothing."""
+    kind = "refused" if isinstance(answer, Reason) else "underway" if isinstance(answer, Underway) else "result"
+    return {"id": number, kind: None if answer is None else wire_form().unstructure(answer)}
 
 
 def number_of(message: Mapping[str, Any]) -> int:
