@@ -217,15 +217,18 @@ class Fusion:
 
     def edge_contrasts(self, poses: NDArray[np.float64]) -> list[float]:
         """How far the edge witness, averaged over its bands, stands above other poses at each of K poses (K, 4, 4);
-        standard deviations."""
-        return _contrasts(self._bands, self._of_bands, poses)
+        standard deviations. Those of two kinds of edges combine as in `ranks`."""
+        by_kind = self.contrasts_by_kind(poses)
+        if len(by_kind) == 1:
+            return by_kind[0]
+        return [hypot(*(max(contrast, 0.0) for contrast in of_pose)) for of_pose in zip(*by_kind, strict=True)]
 
     def edge_contrast(self, T_camera_lidar: Matrix4) -> float:
         """The same at one pose (4, 4)."""
         return self.edge_contrasts(T_camera_lidar[None])[0]
 
     def contrasts_by_kind(self, poses: NDArray[np.float64]) -> list[list[float]]:
-        """The same for each kind of edges by itself."""
+        """How far each kind of edges by itself stands above other poses."""
         return [_contrasts(bands, scale, poses) for bands, scale in self._kinds]
 
     def depth_contrasts(self, poses: NDArray[np.float64]) -> list[float]:

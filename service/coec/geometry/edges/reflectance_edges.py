@@ -37,6 +37,10 @@ LEAST_STEP = 5.0
 PLATEAU_SHARE = 0.5
 """Largest difference between the two points of a side, as a share of the height."""
 
+SURFACE_SHARE = 0.03
+"""Standard deviation of the reflectance of one surface, as a share of it: weaker steps are its grain, not an edge that
+an image would show."""
+
 LEVELS = 24
 """Levels of reflectance for which the noise is learned, each with as many steps as the others."""
 
@@ -118,10 +122,10 @@ def learn_noise(sweeps: Sequence[ReflectanceSteps]) -> ReflectanceNoise | None:
     levels = np.array([np.median(level[part]) for part in parts])
     sigma = MEDIAN_TO_SIGMA * np.array([np.median(height[part]) for part in parts], np.float64)
     quantum = min(steps.quantum for steps in sweeps)
-    least = max(QUANTISATION * quantum, 1e-3 * float(np.ptp(levels)), 1e-9)
     # Levels of one value, as zero often is, form several parts.
     distinct, first = np.unique(levels, return_index=True)
-    return ReflectanceNoise(distinct, np.hypot(sigma[first], least))
+    grain = SURFACE_SHARE * np.maximum(np.abs(distinct), 1e-3 * np.ptp(levels))
+    return ReflectanceNoise(distinct, np.hypot(np.hypot(sigma[first], QUANTISATION * quantum), grain))
 
 
 def reflectance_edges(steps: ReflectanceSteps, noise: ReflectanceNoise) -> SweepEdges:
