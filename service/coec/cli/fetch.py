@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from coec.io.zenoh.query_client import RecordingInfo
     from coec.schemas.documents import Absent, FetchedFile, FetchedWindow, IncidentReport
     from coec.schemas.message import Message
-    from coec.schemas.replies import ChainedEntry, EvidenceEvent, HistoryReply, WindowsReply
+    from coec.schemas.replies import ChainedEntry, EvidenceEvent, HistoryReply
 
 LATEST: Final = "latest"
 VEHICLE: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}")
@@ -61,6 +61,7 @@ PAGE = "index.html"
 REPORT = "incident.json"
 
 M = TypeVar("M", bound="Message")
+T = TypeVar("T")
 
 
 def fetch(
@@ -263,14 +264,12 @@ class Download:
     def _optional(self, name: str, model: type[M], selector: str) -> M | None:
         from coec.schemas.message import to_json
 
-        documents: list[M] = []
+        def fetch() -> M:
+            document = self._document(model, selector)
+            self._store(name, to_json(document))
+            return document
 
-        def fetch() -> None:
-            documents.append(self._document(model, selector))
-            self._store(name, to_json(documents[0]))
-
-        self._try(name, fetch)
-        return documents[0] if documents else None
+        return self._try(name, fetch)
 
     def _configuration(self) -> bytes:
         """The configuration as the vehicle sends it; a newer vehicle may have keys that this program does not know."""
@@ -309,11 +308,10 @@ class Download:
         from coec.schemas.documents import Absent
         from coec.schemas.replies import WindowsReply
 
-        listed: list[WindowsReply] = []
-        self._try("snippets", lambda: listed.append(self._document(WindowsReply, self.keys.windows(self.pair))))
+        listed = self._try("snippets", lambda: self._document(WindowsReply, self.keys.windows(self.pair)))
         near = [
             snippet
-            for snippet in (listed[0].snippets if listed else ())
+            for snippet in (listed.snippets if listed is not None else ())
             if abs(snippet.stamp_ns - event.stamp_ns) <= SNIPPET_NS
         ]
         near.sort(key=lambda snippet: abs(snippet.stamp_ns - event.stamp_ns))
@@ -333,7 +331,6 @@ class Download:
             self.absent.append(Absent(what="a recording", why="the vehicle reports an invalid name for it"))
             return None
         name = _recorded(recording_id)
-        recordings: list[RecordingInfo] = []
         left = MAX_RECORDED_BYTES - self.recorded_bytes
         if left <= 0:
             how = f"`coec query windows/{recording_id} --output FILE` fetches it"
@@ -341,7 +338,7 @@ class Download:
             self.absent.append(Absent(what=name, why=why))
             return None
 
-        def fetch() -> None:
+        def fetch() -> RecordingInfo:
             with console.progress(counted=False) as bars:
                 info = fetch_window(
                     self.session,
@@ -356,10 +353,9 @@ class Download:
                 )
             self.recorded_bytes += info.size_bytes
             self.files[name] = FetchedFile(name=name, sha256=str(info.sha256), size_bytes=info.size_bytes)
-            recordings.append(info)
+            return info
 
-        self._try(name, fetch)
-        return recordings[0] if recordings else None
+        return self._try(name, fetch)
 
     def _answer(self, selector: str) -> bytes:
         from coec.io.zenoh.query_client import query_one
@@ -373,15 +369,17 @@ class Download:
                     raise
             time.sleep(WAIT_S)
 
-    def _try(self, what: str, fetch: Callable[[], None]) -> None:
+    def _try(self, what: str, fetch: Callable[[], T]) -> T | None:
+        """What is fetched; None, and a note why, if that cannot be had."""
         from coec.schemas.documents import Absent
 
         try:
-            fetch()
+            return fetch()
         except OutputError:
             raise
         except CoecError as error:
             self.absent.append(Absent(what=what, why=str(error)))
+            return None
 
     def _store(self, name: str, data: bytes) -> None:
         import hashlib

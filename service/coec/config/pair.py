@@ -129,6 +129,8 @@ if TYPE_CHECKING:
 else:
     CameraModel = Literal[CAMERA_MODELS]
 
+# --- streams and pairs ------------------------------------------------------------------------------------------------
+
 ROS_NAMES = {
     "plumb_bob": "radtan",
     "rational_polynomial": "rational",

@@ -156,6 +156,8 @@ def _worker_main(link: Connection, settings: str) -> None:
         thread.join()
 
 
+# --- a Ray cluster ----------------------------------------------------------------------------------------------------
+
 ADDRESS = "RAY_ADDRESS"
 """Environment variable of Ray with the address of the cluster."""
 

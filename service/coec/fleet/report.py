@@ -273,6 +273,8 @@ def columns(folder: Path) -> list[tuple[str, str]]:
     return [(str(name), str(kind)) for name, kind, *_ in described]
 
 
+# --- the report -------------------------------------------------------------------------------------------------------
+
 S_PER_H = 3600.0
 
 CONFIDENCE = 0.95

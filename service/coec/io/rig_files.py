@@ -281,6 +281,8 @@ def _read_camera(value: Any, _: object) -> cameras.Camera:
 _FORM = _rig_form()
 
 
+# --- baselines --------------------------------------------------------------------------------------------------------
+
 BASELINES = "rig.json"
 """File in the state directory with what was learned when the pairs were commissioned."""
 

@@ -435,6 +435,8 @@ def _weighted_median(values: NDArray[np.float64], weight: NDArray[np.float64]) -
     return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])
 
 
+# --- the close-ups ----------------------------------------------------------------------------------------------------
+
 BAR_SHARE = 0.3
 """A scale bar takes at most this share of the width."""
 

@@ -233,6 +233,8 @@ def colour_scale(
     write(picture, label, (area.left + area.width / 2, bottom + TICK_PX + 34), align=0.5)
 
 
+# --- points on an image -----------------------------------------------------------------------------------------------
+
 MIN_WIDTH_PX = 960
 """Narrower images are enlarged by a whole factor, so that the title is legible."""
 

@@ -352,6 +352,8 @@ def _cell(view: Pixels, shifts: LocalShifts, place: tuple[int, int], end_deg: fl
         drawing.write(view, figure, (middle[0], baseline), LABEL_PX, align=0.5, colour=ink, ground=0.7)
 
 
+# --- a fitted lens ----------------------------------------------------------------------------------------------------
+
 SAMPLES = 200
 """Samples along the longer side of the image; so few suffice because a lens is a smooth function."""
 
@@ -450,6 +452,8 @@ def lens_sentences(camera: Camera, fitted: Camera, size_px: NDArray[np.float64])
         "Arrows: the direction.",
     ]
 
+
+# --- files, and blocks of a page --------------------------------------------------------------------------------------
 
 PAGE_JPEG_QUALITY = 95
 """JPEG quality of pictures for a page, which shrinks large ones again."""

@@ -81,6 +81,8 @@ class DoctorReport(Message):
     findings: tuple[Finding, ...]
 
 
+# --- many vehicles ----------------------------------------------------------------------------------------------------
+
 AXES = ("rx_deg", "ry_deg", "rz_deg", "tx_m", "ty_m", "tz_m")
 """Columns of a correction, in order; with the prefix `sigma_` they hold its standard deviations."""
 

@@ -215,6 +215,8 @@ def value_differences(before: Any, after: Any, at: str = "") -> Iterator[tuple[s
         yield at, before, after
 
 
+# --- the replay -------------------------------------------------------------------------------------------------------
+
 POLL_S = 0.02
 """Longest wait for a worker or the disk before events are looked for again, s."""
 
@@ -521,6 +523,9 @@ def _action_texts(actions: Sequence[messages.Action]) -> Iterator[str]:
                 yield f"check of {count(len(action.pairs), 'pair')}, counts from {action.request.due_ns} ns"
             case _:
                 yield _type_label(action)
+
+
+# --- for people -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)

@@ -247,6 +247,8 @@ def figures_of(metrics: Mapping[str, MetricReply]) -> tuple[viewer_scene.Timelin
     )
 
 
+# --- a running vehicle ------------------------------------------------------------------------------------------------
+
 REPEAT_S = 1.0
 """Time between two lines of the timeline while nothing changes."""
 

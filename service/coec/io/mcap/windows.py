@@ -216,6 +216,8 @@ class WindowContent:
         return None
 
 
+# --- reading ----------------------------------------------------------------------------------------------------------
+
 MAX_UNPACKED = 64
 """A window may unpack to at most this many times its size (plus `CHUNK_BYTES`). No tool compresses images and clouds to
 a sixtieth."""
@@ -349,6 +351,9 @@ def _size(path: Path) -> int:
         return path.stat().st_size
     except OSError as error:
         raise WindowError(f"cannot read {path}: {error.strerror}") from error
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)

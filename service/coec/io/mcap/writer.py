@@ -438,6 +438,9 @@ def failing_as_recording_error(path: Path) -> Iterator[None]:
         ) from error
 
 
+# --- snippets ---------------------------------------------------------------------------------------------------------
+
+
 def with_suffix(path: Path, suffix: str) -> Path:
     """The path with a suffix added to the file name."""
     return path.with_name(path.name + suffix)
@@ -579,6 +582,9 @@ def metadata_of(path: Path) -> dict[str, str]:
     except McapDamagedError as error:
         raise WindowError(error.of(path)) from error
     return {}
+
+
+# --- bags -------------------------------------------------------------------------------------------------------------
 
 
 def write_bag(

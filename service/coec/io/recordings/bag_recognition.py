@@ -324,6 +324,8 @@ def as_compensated(sweep: LidarFrame, instant: str) -> LidarFrame:
     return replace(sweep, time_offset_s=np.full(len(sweep.xyz_m), at_s, np.float32))
 
 
+# --- the rig ----------------------------------------------------------------------------------------------------------
+
 IN_VIEW: Final = 0.03
 """Share of a sweep's points that a camera sees at least. A 60° camera sees a tenth of a turning LiDAR's."""
 

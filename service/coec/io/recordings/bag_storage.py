@@ -98,6 +98,9 @@ class BagStorage(Protocol):
 _NO_CHUNK = -1
 
 
+# --- MCAP -------------------------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True, slots=True)
 class McapStorage:
     """The `Storage` of an MCAP file. A place is: file offset of the chunk (-1 outside chunks), offset in the chunk,
@@ -205,6 +208,9 @@ MIN_ROW_BYTES = 4
 _TABLES = {"topics", "messages"}
 
 
+# --- SQLite -----------------------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True, slots=True)
 class SqliteStorage:
     """The `Storage` of a SQLite file. A place is the row of a message."""
@@ -291,6 +297,8 @@ class _SqliteReader:
         """See `Reader`."""
         return self.storage.read_from(self.connection, place[0])
 
+
+# --- bags of ROS 1 ----------------------------------------------------------------------------------------------------
 
 MAGIC: Final = b"#ROSBAG V2.0\n"
 
@@ -526,6 +534,8 @@ METADATA = "metadata.yaml"
 
 MAX_FILES = 10_000
 """Most files of one bag: a day in files of ten seconds."""
+
+# --- folders ----------------------------------------------------------------------------------------------------------
 
 MAX_UNPACKED_MESSAGE_BYTES = 256 * 2**20
 """Largest unpacked size of one packed message, bytes; the same as for MCAP's chunks."""

@@ -374,6 +374,8 @@ def parse_ply(data: bytes) -> Table:
     return _table(data, _bounded_header(_Header(np.dtype(fields), points, form, body, last_line)))
 
 
+# --- clouds from tables -----------------------------------------------------------------------------------------------
+
 Columns = Mapping[str, NDArray[Any]]
 """`x`, `y` and `z`, and if the file has them `intensity`, `ring` and times, each (N,). Not filtered."""
 

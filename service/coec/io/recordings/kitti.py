@@ -216,6 +216,8 @@ def _frame(stamp_ns: int, camera: str, image: Path, cloud: Path, depth: Path | N
     return RecordedFrame(stamp_ns, load_picture, stamp_ns, load_scan)
 
 
+# --- raw drives -------------------------------------------------------------------------------------------------------
+
 CAMERAS = ("image_00", "image_01", "image_02", "image_03")
 LIDAR_FRAME = "velodyne"
 EGO_FRAME = "imu"
@@ -349,6 +351,8 @@ def _vector(values: NDArray[np.float64], places: tuple[int, int, int]) -> tuple[
     return x, y, z
 
 
+# --- the odometry benchmark -------------------------------------------------------------------------------------------
+
 ODOMETRY_CAMERAS = ("image_0", "image_1", "image_2", "image_3")
 
 COMPENSATED = Recognition(
@@ -418,6 +422,8 @@ def _odometry_stamps(path: Path, last: int) -> list[int]:
         raise SourceError(f"{path}: the times do not ascend from 0")
     return stamps_ns
 
+
+# --- KITTI-360 --------------------------------------------------------------------------------------------------------
 
 PERSPECTIVE = {"image_00": "00", "image_01": "01"}
 FISHEYE = ("image_02", "image_03")

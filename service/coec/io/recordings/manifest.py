@@ -312,6 +312,9 @@ DIGITS = 9
 OTHER_DIRECTION = {"T_camera_lidar": "T_lidar_camera", "T_lidar_camera": "T_camera_lidar"}
 
 
+# --- the file without a mistake ---------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True, slots=True)
 class Correction:
     """A corrected manifest, and what was changed in it, one sentence each."""

@@ -173,6 +173,8 @@ def _tiff_size(data: bytes, order: str) -> tuple[int, int]:
     return values.get(_WIDTH, 0), values.get(_HEIGHT, 0)
 
 
+# --- messages ---------------------------------------------------------------------------------------------------------
+
 ENCODINGS: Final[dict[str, ImageFormat]] = {
     **{form.value: form for form in BYTES_PER_PIXEL},
     "8UC1": ImageFormat.MONO8,

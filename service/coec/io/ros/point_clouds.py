@@ -631,6 +631,8 @@ def _view(message: PointCloud2, dtype: np.dtype[Any], offset: int) -> NDArray[An
     )
 
 
+# --- Livox's own message ----------------------------------------------------------------------------------------------
+
 TYPES: Final = (
     "livox_ros_driver2/msg/CustomMsg",
     "livox_ros_driver/msg/CustomMsg",

@@ -471,6 +471,8 @@ def _exchange(session: zenoh.Session, conversation: str, timeout_s: float, outgo
         time.sleep(BUSY_PAUSE_S)
 
 
+# --- recorded windows -------------------------------------------------------------------------------------------------
+
 PIECE_BYTES: Final = 2**19
 """Size of a piece: half a second at the rate at which a vehicle sends by default. A broken link loses one piece."""
 

@@ -391,6 +391,8 @@ def _certificate(seen: Mapping[str, Any]) -> Certificate:
     )
 
 
+# --- settings and sessions --------------------------------------------------------------------------------------------
+
 GOSSIP = "scouting/gossip/enabled"
 
 DEAF_US = 2_000_000

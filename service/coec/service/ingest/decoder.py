@@ -556,6 +556,8 @@ def _check_camera(frame: CameraFrame, camera: CameraConfig) -> None:
         raise DecodeError("image_size", "differs from the size in the intrinsics")
 
 
+# --- the stream of one sensor -----------------------------------------------------------------------------------------
+
 RATE_FRAMES = 30
 """The rate is measured over the first so many frames."""
 
