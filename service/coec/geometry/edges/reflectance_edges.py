@@ -38,7 +38,7 @@ PLATEAU_SHARE = 0.5
 """Largest difference between the two points of a side, as a share of the height."""
 
 SURFACE_SHARE = 0.03
-"""Standard deviation of the reflectance of one surface, as a share of it: weaker steps are its grain, not an edge that
+"""Standard deviation of the reflectance of one surface, as a share of it: weaker steps are its texture, not an edge that
 an image would show."""
 
 LEVELS = 24
@@ -124,8 +124,8 @@ def learn_noise(sweeps: Sequence[ReflectanceSteps]) -> ReflectanceNoise | None:
     quantum = min(steps.quantum for steps in sweeps)
     # Levels of one value, as zero often is, form several parts.
     distinct, first = np.unique(levels, return_index=True)
-    grain = SURFACE_SHARE * np.maximum(np.abs(distinct), 1e-3 * np.ptp(levels))
-    return ReflectanceNoise(distinct, np.hypot(np.hypot(sigma[first], QUANTISATION * quantum), grain))
+    texture = SURFACE_SHARE * np.maximum(np.abs(distinct), 1e-3 * np.ptp(levels))
+    return ReflectanceNoise(distinct, np.hypot(np.hypot(sigma[first], QUANTISATION * quantum), texture))
 
 
 def reflectance_edges(steps: ReflectanceSteps, noise: ReflectanceNoise) -> SweepEdges:
