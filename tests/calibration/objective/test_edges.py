@@ -133,9 +133,7 @@ def with_reflectance(window: Window, values: Callable[[int, Points], NDArray[np.
     )
 
 
-def test_the_weight_of_a_kind_of_edges_is_its_mean_strength(
-    sharp_street: Window, sharp_edges: EdgeCue
-) -> None:
+def test_the_weight_of_a_kind_of_edges_is_its_mean_strength(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     truth = sharp_street.T_camera_lidar_start
     balanced = sharp_edges.balanced_at(truth)
     band = balanced.bands[0]

@@ -38,8 +38,8 @@ PLATEAU_SHARE = 0.5
 """Largest difference between the two points of a side, as a share of the height."""
 
 SURFACE_SHARE = 0.03
-"""Standard deviation of the reflectance of one surface, as a share of it: weaker steps are its texture, not an edge that
-an image would show."""
+"""Standard deviation of the reflectance of one surface, as a share of it: weaker steps are its texture, not an edge
+that an image would show."""
 
 LEVELS = 24
 """Levels of reflectance for which the noise is learned, each with as many steps as the others."""
