@@ -91,6 +91,8 @@ def test_code_in_sentences_stands_between_backticks() -> None:
 
     assert shown("run `coec <x>` now") == "run <code>coec &lt;x&gt;</code> now"
     assert shown("one ` alone <b>") == "one ` alone &lt;b&gt;"
+    assert shown(f"{significant(57597.2)}, {percent(0.5)}") == f"{significant(57597.2)}, {percent(0.5)}"
+    assert shown("reversed \u202e") == "reversed \\u202e"
 
 
 def test_small_pictures_stay_as_they_are_and_large_ones_are_made_to_fit() -> None:

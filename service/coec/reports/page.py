@@ -434,12 +434,18 @@ def _environment() -> Environment:
 
 def _finalized(value: object) -> object:
     """What an expression of a template comes to, as it stands in the page before its markup is escaped."""
-    return printable_lines(value) if isinstance(value, str) and not isinstance(value, Markup) else value
+    return _escaped_controls(value) if isinstance(value, str) and not isinstance(value, Markup) else value
+
+
+def _escaped_controls(text: str) -> str:
+    """As `printable_lines`, but with the narrow space of `formatting` between digits, and before a percent sign."""
+    narrow = "\N{NARROW NO-BREAK SPACE}"
+    return narrow.join(printable_lines(part) for part in text.split(narrow))
 
 
 def _prose(text: str) -> Markup:
     """A sentence as HTML. Text between two backticks is code; with an odd number of backticks none is."""
-    text = printable_lines(text)
+    text = _escaped_controls(text)
     parts = text.split("`")
     if len(parts) % 2 == 0:
         return escape(text)
