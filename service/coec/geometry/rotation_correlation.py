@@ -131,12 +131,12 @@ def _wigner_sums(of_camera: Complexes, of_lidar: Complexes, cosine: NDArray[np.f
                 product += of_camera[m, f, degree] * of_lidar[column, f, degree]
             of_real, of_imaginary = product.real, product.imag
             # Three-term recursion in the degree (Kostelec, Rockmore 2008, equation 2.11 without its norm).
-            l, above = float(degree), degree + 1.0
+            below, above = float(degree), degree + 1.0
             root = math.sqrt((above * above - m * m) * (above * above - n * n))
-            ahead, middle, back = above * (2.0 * l + 1.0) / root, 0.0, 0.0
+            ahead, middle, back = above * (2.0 * below + 1.0) / root, 0.0, 0.0
             if degree > 0:
-                middle = (2.0 * l + 1.0) * m * n / (l * root)
-                back = above / l * math.sqrt((l * l - m * m) * (l * l - n * n)) / root
+                middle = (2.0 * below + 1.0) * m * n / (below * root)
+                back = above / below * math.sqrt((below * below - m * m) * (below * below - n * n)) / root
             for j in range(rows):
                 d = here[j]
                 real[j] += d * of_real

@@ -18,7 +18,7 @@ from coec.geometry import se3
 from coec.geometry.cameras import in_image
 from coec.geometry.edges.alignment import EdgeFrames
 from coec.geometry.edges.charts import EdgeCharts, charted_significances, pattern_search, select_separated
-from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID
+from coec.geometry.edges.image_edges import VOID
 from coec.geometry.points import lengths, thinned
 from coec.geometry.projection import project
 from coec.geometry.rotation_correlation import RotationGrid, local_maxima
@@ -29,22 +29,23 @@ BANDWIDTH = 128
 VIEW_BANDWIDTH = 32
 """Bandwidth of how much of a cloud is in view, which varies slowly."""
 
-LEAST_IN_VIEW = 0.1
+LEAST_IN_VIEW = 0.05
 """A pose that has less than this share of the range edges in view that another pose has, by weight, is no candidate.
 The cloud of a solid-state LiDAR covers only a part of the sphere, and its edge fits any image edge somewhere."""
 
-PLACES_M = np.array([[0.0, 0.0, 0.0]])
-"""(n, 3) places of the camera in the LiDAR frame from which rotations are correlated where its place is unknown."""
-
 PLACE_KNOWN_M = 0.3
-"""How far the camera may be from such a place. Range edges nearer than this over the blur count less, because their
-directions are uncertain."""
+"""How far a camera usually is from the LiDAR if its place is unknown. Range edges nearer than this over the blur count
+less, because their directions are uncertain."""
 
 FARTHEST_M = 3.0
 """How far from the LiDAR the camera may be."""
 
-MAXIMA = 20_000
-"""Maxima of a correlation that are compared."""
+MAXIMA = 30_000
+"""Maxima of the correlation that are compared."""
+
+IN_VIEW_POWER = 0.75
+"""Maxima are compared by Σ w·e over this power of the weight in view, Σ w². With ½ it would be the significance, which
+ranks poses with much in view too high: a layout that happens to fit adds more than noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +62,7 @@ class _Round:
 
 
 ROUNDS = (
-    _Round(3_000, radians(1.0), COARSE, 8_000, radians(0.9), 1),
+    _Round(6_000, radians(1.0), COARSE, 6_000, radians(0.9), 1),
     _Round(600, radians(0.8), FINE, 12_000, radians(0.45), 1),
     _Round(100, radians(2.5), FINE, 30_000, radians(0.2), 1),
 )
@@ -92,19 +93,15 @@ def find_free_basins(edges: EdgeCue, place_m: NDArray[np.float64], *, turns_only
     and else anywhere within `FARTHEST_M` of it."""
     grid, coarsest = RotationGrid(BANDWIDTH), edges.bands[-1]
     signal = _edges_on_sphere(coarsest, grid)
-    places = place_m[None] if turns_only else place_m + PLACES_M
-    maxima, rotations = [], 0
-    for place in places:
-        poses, in_view = _correlated(coarsest, signal, grid, place, edges.band_blur_rad[-1], known=turns_only)
-        maxima.append(poses)
-        rotations += in_view
-    poses, centre = np.concatenate(maxima), np.eye(4)
+    poses, rotations = _correlated(coarsest, signal, grid, place_m, edges.band_blur_rad[-1], known=turns_only)
+    climbed, centre, reach = len(poses), np.eye(4), np.array([pi, 0.0 if turns_only else FARTHEST_M])
     centre[:3, 3] = -place_m
-    reach, climbed = np.array([pi, 0.0 if turns_only else FARTHEST_M]), min(len(poses), ROUNDS[0].poses)
     z = np.zeros(len(poses))
     for number in ROUNDS:
-        charts = _at_most(edges.charts[number.chart], number.points)
-        best = _separated(poses, charted_significances(charts, poses), number)
+        charts, best = _at_most(edges.charts[number.chart], number.points), np.arange(len(poses))
+        if number is not ROUNDS[0]:
+            # A maximum may lie so far from its rotation of the grid that it does not show on the chart there.
+            best = _separated(poses, charted_significances(charts, poses), number)
         steps = se3.axis_steps(number.step_rad)
         steps[3:] = 0.0 if turns_only else steps[3:]
         poses, z = pattern_search(charts, poses[best], steps, number.halvings, centre, reach)
@@ -140,8 +137,8 @@ def _correlated(
     *,
     known: bool,
 ) -> tuple[NDArray[np.float64], int]:
-    """(K, 4, 4) the highest maxima of the significance over all rotations, for a camera at `place_m` (3,), and how many
-    rotations have enough in view."""
+    """(K, 4, 4) the highest maxima over all rotations that lie apart, the highest first, for a camera at `place_m`
+    (3,), and how many rotations have enough in view."""
     from_place = frames.xyz_m.T.astype(np.float64) - place_m
     weight = frames.weight.astype(np.float64)
     if not known:
@@ -150,19 +147,19 @@ def _correlated(
     frame = np.repeat(np.arange(len(frames.maps)), np.diff(frames.first_point))
     of_frames = np.bincount(frame * count + cells, weight, len(frames.maps) * count).reshape(-1, count)
     squares = np.bincount(cells, weight**2, count)[None]
-    z = grid.correlation(signal[0], grid.harmonics(of_frames))
+    score = grid.correlation(signal[0], grid.harmonics(of_frames))
     of_squares = grid.harmonics(squares)[:VIEW_BANDWIDTH, :, :VIEW_BANDWIDTH]
     square = grid.correlation(signal[1], of_squares)
     least = LEAST_IN_VIEW * float(square.max())
     enough = square > least
-    z /= np.float32(STRENGTH_STEPS) * np.sqrt(np.maximum(square, np.float32(least)))
-    z[~enough] = -1.0
-    maxima = local_maxima(z, 0.0)
-    maxima = maxima[np.argsort(-z.ravel()[maxima], kind="stable")[:MAXIMA]]
+    score /= np.maximum(square, np.float32(least)) ** np.float32(IN_VIEW_POWER)
+    score[~enough] = -1.0
+    maxima = local_maxima(score, 0.0)
+    maxima = maxima[np.argsort(-score.ravel()[maxima], kind="stable")[:MAXIMA]]
     poses = np.tile(np.eye(4), (len(maxima), 1, 1))
     poses[:, :3, :3] = grid.rotations(maxima)
     poses[:, :3, 3] = -np.einsum("kij,j->ki", poses[:, :3, :3], place_m)
-    return poses, int(enough.sum())
+    return poses[_separated(poses, -np.arange(len(poses), dtype=np.float64), ROUNDS[0])], int(enough.sum())
 
 
 def _at_most(charts: EdgeCharts, points: int) -> EdgeCharts:

@@ -1,5 +1,5 @@
-"""Solves a window without an initial guess: any rotation between camera and LiDAR, and, with six degrees of freedom, the
-camera anywhere within some metres.
+"""Solves a window without an initial guess: any rotation between camera and LiDAR, and, with six degrees of freedom,
+the camera anywhere within some metres.
 
 The basins of the edges over all rotations (`free_rotation`) are ranked by both cues, each like a basin about a start of
 its own. The best become starts of the ordinary solver. Nothing is known before, so that the prior of the pose is flat,
@@ -227,8 +227,8 @@ def _stricter(config: CalibrationConfig) -> CalibrationConfig:
 
 
 def limit_for_more_poses(limit: float, more_poses: float) -> float:
-    """The limit of a significance, standard deviations, at which the best of `more_poses` (a factor) times as many wrong
-    poses passes as rarely: the tail of a normal deviate falls with half its square."""
+    """The limit of a significance, standard deviations, at which the best of `more_poses` (a factor) times as many
+    wrong poses passes as rarely: the tail of a normal deviate falls with half its square."""
     return sqrt(limit * limit + 2.0 * log(more_poses))
 
 
