@@ -27,6 +27,10 @@ LEAST_ORDER = 0.1
 """Largest mean square of that share, over that along another axis, of clouds with scan lines. A cloud without order has
 1."""
 
+MOST_ALONG = 0.9
+"""Largest mean cosine between the points and the axis. All chords of a cloud that covers a narrow cone are
+perpendicular to where it looks, in whatever order its points are."""
+
 ALIGNED_RAD = radians(2.0)
 """Clouds whose axis is this near to z stay as they are."""
 
@@ -34,7 +38,8 @@ ALIGNED_RAD = radians(2.0)
 def scan_axis(sweeps: Sequence[LidarFrame]) -> NDArray[np.float64] | None:
     """(3,) the axis of the scan lines, a unit vector with the z axis on its side; None if successive points form no
     lines."""
-    chords = np.concatenate([_chords(sweep) for sweep in sweeps])
+    directions = [_directions(sweep) for sweep in sweeps]
+    chords = np.concatenate([_chords(*of_sweep) for of_sweep in directions])
     if len(chords) == 0:
         return None
     kept = chords
@@ -44,18 +49,24 @@ def scan_axis(sweeps: Sequence[LidarFrame]) -> NDArray[np.float64] | None:
         if spreads[-1][0] > LEAST_ORDER * spreads[-2][0]:
             return None
         kept = chords[np.abs(chords @ axis) < most]
+    if float(np.mean(np.concatenate([np.abs(seen @ axis) for seen, _ in directions]))) > MOST_ALONG:
+        return None
     return axis if axis[2] >= 0.0 else -axis
 
 
-def _chords(sweep: LidarFrame) -> NDArray[np.float64]:
-    """(n, 3) unit vectors from one direction to the next on its scan line."""
-    order = np.arange(len(sweep.xyz_m)) if sweep.ring is None else np.argsort(sweep.ring, kind="stable")
+def _directions(sweep: LidarFrame) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """(N, 3) unit vectors to the points in the order of their scan lines, and (N,) the lines, as far as known."""
+    ring = np.zeros(len(sweep.xyz_m), np.int64) if sweep.ring is None else sweep.ring.astype(np.int64)
+    order = np.argsort(ring, kind="stable")
     xyz_m = sweep.xyz_m[order].astype(np.float64)
-    chords = np.diff(xyz_m / np.maximum(np.linalg.norm(xyz_m, axis=1, keepdims=True), 1e-9), axis=0)
+    return xyz_m / np.maximum(np.linalg.norm(xyz_m, axis=1, keepdims=True), 1e-9), ring[order]
+
+
+def _chords(directions: NDArray[np.float64], ring: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(n, 3) unit vectors from one direction to the next on its scan line."""
+    chords = np.diff(directions, axis=0)
     length = np.linalg.norm(chords, axis=1)
-    together = (length > CHORD_RAD[0]) & (length < CHORD_RAD[1])
-    if sweep.ring is not None:
-        together &= np.diff(sweep.ring[order].astype(np.int64)) == 0
+    together = (length > CHORD_RAD[0]) & (length < CHORD_RAD[1]) & (np.diff(ring) == 0)
     return np.asarray(chords[together] / length[together, None])
 
 
