@@ -20,6 +20,7 @@ from coec.calibration.objective.fused import Fusion
 from coec.calibration.objective.mutual_information import SearchBox
 from coec.calibration.pipeline import estimate_of
 from coec.calibration.search.free_rotation import FARTHEST_M, find_free_basins
+from coec.calibration.search.global_search import sample_reach
 from coec.calibration.solver import (
     SAME_BASIN_RAD,
     EstimatorResult,
@@ -43,15 +44,17 @@ from coec.calibration.types import (
 from coec.config import CalibrationConfig
 from coec.errors import CalibrationError, UsageError
 from coec.geometry import se3
+from coec.geometry.edges.charts import charted_significances
 from coec.geometry.points import thinned
 
-RANKED = 48
-"""Basins of the edges that are ranked by both cues."""
+SHORTLISTED, OTHER_POSES, SHORTLIST_POINTS = 16, 64, 20_000
+"""So many basins are ranked by both cues: those that stand out most among so many other poses within the reach of the
+solver, by so many edges on the charts. A significance alone is larger where more is in view, also of wrong poses."""
 
 RANKING_DEPTH_POINTS = 40_000
 """Points of the window's clouds that rank a basin by depth."""
 
-SOLVED, COMPARABLE = 3, 0.75
+SOLVED, COMPARABLE = 4, 0.7
 """At most so many candidates are solved: those with at least this share of the best rank."""
 
 NEIGHBOURS_RAD = radians(8.0)
@@ -129,11 +132,13 @@ def _solve(data: WindowData, config: CalibrationConfig) -> tuple[EstimatorResult
     edges = build_edges(window.pairs, data.points, data.greys(), rig)
     basins = find_free_basins(edges, place_m, turns_only=turns_only)
     data.progress.step("basins", 1, 1)
-    candidates = _ranked(edges, data, basins.poses[:RANKED], config)
+    search = config.search
+    reach = SearchBox(radians(search.reach_deg), 0.0 if turns_only else search.reach_m)
+    candidates = _ranked(edges, data, _shortlist(edges, basins.poses, reach), reach, config)
     if not candidates:
         raise CalibrationError("no pose of the camera brings range edges into view: check the mask and the intrinsics")
     ends = [_solved(candidate, data, place_m, config) for candidate in _to_solve(candidates)]
-    best, result, started = max(ends, key=lambda end: hypot(_edge_contrast(end[1]), max(end[0].depth, 0.0)))
+    best, result, started = max(ends, key=lambda end: hypot(_least_contrast(end[1]), max(end[0].depth, 0.0)))
     pose = result.search.T_camera_lidar
     rivals = [
         one.edges
@@ -144,12 +149,23 @@ def _solve(data: WindowData, config: CalibrationConfig) -> tuple[EstimatorResult
     return _with_rivals(result, rivals), started, weighed
 
 
+def _shortlist(edges: EdgeCue, poses: NDArray[np.float64], reach: SearchBox) -> NDArray[np.float64]:
+    """The basins (K, 4, 4) that stand out most among the poses about them."""
+    about = np.concatenate([np.concatenate([pose[None], sample_reach(pose, reach, OTHER_POSES)]) for pose in poses])
+    of_charts = [
+        charted_significances(charts.of_points(thinned(len(charts.weight), SHORTLIST_POINTS)), about)
+        for charts in edges.charts
+    ]
+    z = np.mean(of_charts, axis=0).reshape(len(poses), -1)
+    contrast = (z[:, 0] - z[:, 1:].mean(axis=1)) / np.maximum(z[:, 1:].std(axis=1), 1e-9)
+    return np.asarray(poses[np.argsort(-contrast, kind="stable")[:SHORTLISTED]])
+
+
 def _ranked(
-    edges: EdgeCue, data: WindowData, poses: NDArray[np.float64], config: CalibrationConfig
+    edges: EdgeCue, data: WindowData, poses: NDArray[np.float64], reach: SearchBox, config: CalibrationConfig
 ) -> list[_Candidate]:
     """The polished basins (K, 4, 4) with something in view, best first."""
-    window, search = data.window, config.search
-    reach = SearchBox(radians(search.reach_deg), search.reach_m if search.dof == 6 else 0.0)
+    window = data.window
     per_sweep = max(RANKING_DEPTH_POINTS // len(window.pairs), 1)
     points = [data.points(k, thinned(len(pair.lidar.xyz_m), per_sweep)) for k, pair in enumerate(window.pairs)]
     maps, candidates = data.depths(), []
@@ -162,7 +178,7 @@ def _ranked(
         except CalibrationError:  # nothing in view
             continue
         fusion = Fusion(edges, depth, pose, reach)
-        (end,) = polish_basins(fusion, RankedBasins((), (), start_is_plausible=True), search, data.progress).ends
+        (end,) = polish_basins(fusion, RankedBasins((), (), start_is_plausible=True), config.search, data.progress).ends
         overlap = depth.evaluate(end.T_camera_lidar).overlap
         candidates.append(
             _Candidate(
@@ -200,6 +216,12 @@ def _solved(
 
 def _edge_contrast(result: EstimatorResult) -> float:
     return next(metric.value for metric in result.metrics if metric.name == "edge_contrast")
+
+
+def _least_contrast(result: EstimatorResult) -> float:
+    """The edge contrast on blurred or on the sharpest edges, whichever is less, as the verdict has it."""
+    sharp = result.objective.evaluate(result.search.T_camera_lidar).edge_contrast
+    return max(min(_edge_contrast(result), sharp), 0.0)
 
 
 def _with_rivals(result: EstimatorResult, rivals: Sequence[float]) -> EstimatorResult:
