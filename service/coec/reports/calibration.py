@@ -98,7 +98,7 @@ def remarks(
     sentences = [str(one["text"]) for one in (*([] if mistake is None else [mistake]), *recognitions)]
     if weighed is not None:
         sentences.append(
-            f"without a start, {weighed['rotations']} rotations were weighed: {weighed['climbed']} maxima climbed, "
+            f"without a start, {weighed['rotations']} rotations were weighed: {weighed['ascended']} maxima climbed, "
             f"{count(weighed['ranked'], 'basin')} ranked by edges and depth, {weighed['solved']} solved"
         )
     if camera_fit is not None:

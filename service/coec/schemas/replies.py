@@ -251,7 +251,7 @@ class WeighedPoses(Part):
     """How many poses a calibration without an initial guess weighed."""
 
     rotations: int = Field(description="rotations that were compared, with enough of the cloud in view")
-    climbed: int = Field(description="local maxima among them that were followed to finer edges")
+    ascended: int = Field(description="local maxima among them that were followed to finer edges")
     ranked: int = Field(description="of these, ranked by edges and depth together")
     solved: int = Field(description="of these, solved as from a start")
 

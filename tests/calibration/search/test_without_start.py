@@ -31,7 +31,7 @@ def solved(window: Window, depth: DepthModel, dof: int = 3) -> Estimate:
     estimate, weighed = calibrate_without_start(
         without_start(window), depth, GreyImages(LimitsConfig()), config, Silence()
     )
-    assert weighed.rotations > 100_000 > weighed.climbed >= weighed.ranked >= weighed.solved > 0
+    assert weighed.rotations > 100_000 > weighed.ascended >= weighed.ranked >= weighed.solved > 0
     return estimate
 
 
@@ -39,30 +39,26 @@ def error_deg(estimate: Estimate, truth: Matrix4) -> float:
     return float(np.degrees(se3.rotation_angle_rad(estimate.optimum.T_camera_lidar @ se3.inverse(truth))))
 
 
-@pytest.mark.parametrize("rotation", [UPSIDE_DOWN, OPTICAL], ids=["upside down", "optical axes"])
-def test_the_pose_is_found_in_any_frame_of_the_lidar(
-    street: Window, stereo: DepthModel, rotation: NDArray[np.float64]
-) -> None:
-    window = turned(street, rotation)
+def test_the_pose_is_found_upside_down(street: Window, stereo: DepthModel) -> None:
+    window = turned(street, UPSIDE_DOWN)
     estimate = solved(window, stereo)
     assert error_deg(estimate, window.rig.T_camera_lidar_nominal) < 0.5
     assert np.degrees(np.linalg.norm(estimate.correction[:3])) < 0.5
 
 
-def test_with_six_degrees_of_freedom_nothing_is_known_of_the_place(street: Window, stereo: DepthModel) -> None:
-    truth = street.rig.T_camera_lidar_nominal
-    window = replace(street, T_camera_lidar_start=np.eye(4))
-    estimate = solved(window, stereo, dof=6)
+def test_with_six_degrees_of_freedom_only_the_clouds_and_images_are_known(street: Window, stereo: DepthModel) -> None:
+    window = turned(street, OPTICAL)
+    truth = window.rig.T_camera_lidar_nominal
+    estimate = solved(replace(window, T_camera_lidar_start=np.eye(4)), stereo, dof=6)
     assert error_deg(estimate, truth) < 1.0
     assert np.linalg.norm(se3.difference(estimate.optimum.T_camera_lidar, truth)[3:]) < 0.2
 
 
 def test_sweeps_of_other_frames_are_refused(street: Window, stereo: DepthModel) -> None:
-    pairs = street.pairs
-    others = [*pairs[3:], *pairs[:3]]
+    pairs = street.pairs[:4]
     mixed = tuple(
         replace(pair, camera=replace(other.camera, stamp_ns=pair.camera.stamp_ns))
-        for pair, other in zip(pairs, others, strict=True)
+        for pair, other in zip(pairs, (*pairs[2:], *pairs[:2]), strict=True)
     )
     estimate = solved(replace(street, pairs=mixed), stereo)
     assert estimate.verdict.decision is Decision.FAILED

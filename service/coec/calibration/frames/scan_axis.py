@@ -42,13 +42,13 @@ def scan_axis(sweeps: Sequence[LidarFrame]) -> NDArray[np.float64] | None:
     chords = np.concatenate([_chords(*of_sweep) for of_sweep in directions])
     if len(chords) == 0:
         return None
-    kept = chords
+    selected = chords
     for most in ALONG:
-        spreads = linalg.eigen(np.einsum("ni,nj->ij", kept, kept).tolist())
+        spreads = linalg.eigen(np.einsum("ni,nj->ij", selected, selected).tolist())
         axis = np.array(spreads[-1][1])
         if spreads[-1][0] > LEAST_ORDER * spreads[-2][0]:
             return None
-        kept = chords[np.abs(chords @ axis) < most]
+        selected = chords[np.abs(chords @ axis) < most]
     if float(np.mean(np.concatenate([np.abs(seen @ axis) for seen, _ in directions]))) > MOST_ALONG:
         return None
     return axis if axis[2] >= 0.0 else -axis

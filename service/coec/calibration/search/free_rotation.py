@@ -80,12 +80,12 @@ class FreeBasins:
     Attributes:
         poses: (K, 4, 4), the most significant first.
         rotations: how many rotations with enough in view were compared.
-        climbed: how many of their maxima climbed.
+        ascended: how many of their maxima ascended.
     """
 
     poses: NDArray[np.float64]
     rotations: int
-    climbed: int
+    ascended: int
 
 
 def find_free_basins(edges: EdgeCue, place_m: NDArray[np.float64], *, turns_only: bool) -> FreeBasins:
@@ -94,7 +94,7 @@ def find_free_basins(edges: EdgeCue, place_m: NDArray[np.float64], *, turns_only
     grid, coarsest = RotationGrid(BANDWIDTH), edges.bands[-1]
     signal = _edges_on_sphere(coarsest, grid)
     poses, rotations = _correlated(coarsest, signal, grid, place_m, edges.band_blur_rad[-1], known=turns_only)
-    climbed, centre, reach = len(poses), np.eye(4), np.array([pi, 0.0 if turns_only else FARTHEST_M])
+    ascended, centre, reach = len(poses), np.eye(4), np.array([pi, 0.0 if turns_only else FARTHEST_M])
     centre[:3, 3] = -place_m
     z = np.zeros(len(poses))
     for number in ROUNDS:
@@ -112,7 +112,7 @@ def find_free_basins(edges: EdgeCue, place_m: NDArray[np.float64], *, turns_only
             )
             poses = np.concatenate([poses, more])
             z = charted_significances(charts, poses)
-    return FreeBasins(poses[_separated(poses, z, ROUNDS[-1])], rotations, climbed)
+    return FreeBasins(poses[_separated(poses, z, ROUNDS[-1])], rotations, ascended)
 
 
 def _edges_on_sphere(frames: EdgeFrames, grid: RotationGrid) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:

@@ -63,11 +63,11 @@ NEIGHBOURS_RAD = radians(8.0)
 
 @dataclass(frozen=True, slots=True)
 class Weighed:
-    """How many poses a search without a start weighed: rotations that were compared, maxima of them that climbed,
+    """How many poses a search without a start weighed: rotations that were compared, maxima of them that ascended,
     basins that were ranked by both cues, and candidates that were solved."""
 
     rotations: int
-    climbed: int
+    ascended: int
     ranked: int
     solved: int
 
@@ -109,7 +109,7 @@ def calibrate_without_start(
         raise CalibrationError("the window holds no pairs of a camera frame and a sweep: check the stamps of both")
     turn, config = upright_turn(window), _stricter(config)
     turned = window if np.array_equal(turn, np.eye(4)) else with_turned_clouds(window, turn)
-    data = prepare_window_data(turned, _KeptDepths(depth), _KeptImages(images), config, progress)
+    data = prepare_window_data(turned, _DepthCache(depth), _ImageCache(images), config, progress)
     result, started, weighed = _solve(data, config)
     estimate = estimate_of(result, started, config)
     pose, moved = estimate.optimum.T_camera_lidar @ turn, estimate.moved
@@ -138,14 +138,14 @@ def _solve(data: WindowData, config: CalibrationConfig) -> tuple[EstimatorResult
     if not candidates:
         raise CalibrationError("no pose of the camera brings range edges into view: check the mask and the intrinsics")
     ends = [_solved(candidate, data, place_m, config) for candidate in _to_solve(candidates)]
-    best, result, started = max(ends, key=lambda end: hypot(_least_contrast(end[1]), max(end[0].depth, 0.0)))
+    best, result, started = max(ends, key=lambda end: hypot(*_contrasts(end[1]), max(end[0].depth, 0.0)))
     pose = result.search.T_camera_lidar
     rivals = [
         one.edges
         for one in candidates
         if one is not best and one.in_view and _angle_rad(one.T_camera_lidar, pose) > SAME_BASIN_RAD
     ]
-    weighed = Weighed(basins.rotations, basins.climbed, len(candidates), len(ends))
+    weighed = Weighed(basins.rotations, basins.ascended, len(candidates), len(ends))
     return _with_rivals(result, rivals), started, weighed
 
 
@@ -218,10 +218,11 @@ def _edge_contrast(result: EstimatorResult) -> float:
     return next(metric.value for metric in result.metrics if metric.name == "edge_contrast")
 
 
-def _least_contrast(result: EstimatorResult) -> float:
-    """The edge contrast on blurred or on the sharpest edges, whichever is less, as the verdict has it."""
+def _contrasts(result: EstimatorResult) -> tuple[float, float]:
+    """The edge contrasts on blurred and on the sharpest edges, 0 if negative. A wrong pose whose blurred edges fit by
+    chance seldom has sharp ones that do."""
     sharp = result.objective.evaluate(result.search.T_camera_lidar).edge_contrast
-    return max(min(_edge_contrast(result), sharp), 0.0)
+    return max(_edge_contrast(result), 0.0), max(sharp, 0.0)
 
 
 def _with_rivals(result: EstimatorResult, rivals: Sequence[float]) -> EstimatorResult:
@@ -258,31 +259,31 @@ def _angle_rad(a: Matrix4, b: Matrix4) -> float:
     return se3.rotation_angle_rad(a @ se3.inverse(b))
 
 
-class _KeptImages:
+class _ImageCache:
     """An image reader that keeps what it has read: the images of a window are used once for every candidate."""
 
     def __init__(self, images: ImageReader) -> None:
         self._images = images
-        self._kept: dict[int, NDArray[np.uint8]] = {}
+        self._cache: dict[int, NDArray[np.uint8]] = {}
 
     def grey(self, frame: CameraFrame) -> NDArray[np.uint8]:
-        if frame.stamp_ns not in self._kept:
-            self._kept[frame.stamp_ns] = self._images.grey(frame)
-        return self._kept[frame.stamp_ns]
+        if frame.stamp_ns not in self._cache:
+            self._cache[frame.stamp_ns] = self._images.grey(frame)
+        return self._cache[frame.stamp_ns]
 
 
-class _KeptDepths:
+class _DepthCache:
     """A depth model that keeps what it has inferred."""
 
     def __init__(self, depth: DepthModel) -> None:
         self._depth = depth
-        self._kept: dict[int, DepthMap] = {}
+        self._cache: dict[int, DepthMap] = {}
 
     @property
     def identity(self) -> str:
         return self._depth.identity
 
     def infer(self, frame: CameraFrame) -> DepthMap:
-        if frame.stamp_ns not in self._kept:
-            self._kept[frame.stamp_ns] = self._depth.infer(frame)
-        return self._kept[frame.stamp_ns]
+        if frame.stamp_ns not in self._cache:
+            self._cache[frame.stamp_ns] = self._depth.infer(frame)
+        return self._cache[frame.stamp_ns]
