@@ -98,8 +98,8 @@ class RotationGrid:
         """(n, 3, 3) R_camera_lidar at flat places (n,) of a correlation."""
         side = 2 * self.bandwidth
         row, first, last = np.unravel_index(index, (side, side, side))
-        step = math.tau / side
-        return np.asarray(_about_z(first * step) @ _about_y(self._polar_rad[row]) @ _about_z(last * step))
+        of_first, of_last = (_about_z(place.astype(np.float64) * (math.tau / side)) for place in (first, last))
+        return np.asarray(np.einsum("nij,njk,nkl->nil", of_first, _about_y(self._polar_rad[row]), of_last))
 
 
 def _about_z(angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from math import cos, radians
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.frames.motion_compensation import azimuth_offsets_s
+from coec.calibration.frames.pairing import azimuth_offsets_s
 from coec.calibration.types import FramePair, LidarFrame, Matrix4, Window
 from coec.geometry import linalg, se3
 

@@ -145,10 +145,10 @@ def _correlated(
         weight /= np.sqrt(1.0 + (PLACE_KNOWN_M / (lengths(from_place) * blur_rad)) ** 2)
     cells, count = grid.cells(from_place), len(grid.directions)
     frame = np.repeat(np.arange(len(frames.maps)), np.diff(frames.first_point))
-    of_frames = np.bincount(frame * count + cells, weight, len(frames.maps) * count).reshape(-1, count)
-    squares = np.bincount(cells, weight**2, count)[None]
-    score = grid.correlation(signal[0], grid.harmonics(of_frames))
-    of_squares = grid.harmonics(squares)[:VIEW_BANDWIDTH, :, :VIEW_BANDWIDTH]
+    of_frames = np.bincount(frame * count + cells, weight, len(frames.maps) * count).astype(np.float64)
+    squares = np.bincount(cells, weight**2, count).astype(np.float64)
+    score = grid.correlation(signal[0], grid.harmonics(of_frames.reshape(-1, count)))
+    of_squares = grid.harmonics(squares[None])[:VIEW_BANDWIDTH, :, :VIEW_BANDWIDTH]
     square = grid.correlation(signal[1], of_squares)
     least = LEAST_IN_VIEW * float(square.max())
     enough = square > least
