@@ -169,7 +169,7 @@ def _first_wigner(m: int, n: int, cosine: NDArray[np.float64], out: NDArray[np.f
 def local_maxima(scores: NDArray[np.float32], least: float) -> NDArray[np.int64]:
     """Flat places of the values (β, α, γ) above `least` that are no lower than their six neighbours; α and γ wrap."""
     rows, side, _ = scores.shape
-    found = []
+    maxima = []
     for row in range(rows):
         for a in range(side):
             for g in range(side):
@@ -183,5 +183,5 @@ def local_maxima(scores: NDArray[np.float32], least: float) -> NDArray[np.int64]
                     and value >= scores[max(row - 1, 0), a, g]
                     and value >= scores[min(row + 1, rows - 1), a, g]
                 ):
-                    found.append((row * side + a) * side + g)
-    return np.array(found, np.int64) if len(found) > 0 else np.empty(0, np.int64)
+                    maxima.append((row * side + a) * side + g)
+    return np.array(maxima, np.int64) if len(maxima) > 0 else np.empty(0, np.int64)

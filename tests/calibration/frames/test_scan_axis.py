@@ -25,7 +25,9 @@ def sweep(turn: NDArray[np.float64], *, rings: bool) -> LidarFrame:
 
 @pytest.mark.parametrize("rings", [True, False])
 @pytest.mark.parametrize("turned_deg", [(0.0, 0.0, 0.0), (90.0, 0.0, 0.0), (25.0, -40.0, 70.0), (0.0, 80.0, 10.0)])
-def test_the_axis_of_a_turning_lidar_is_found_in_any_frame(turned_deg: tuple[float, float, float], rings: bool) -> None:
+def test_the_axis_of_a_turning_lidar_is_recovered_in_any_frame(
+    turned_deg: tuple[float, float, float], rings: bool
+) -> None:
     turn = se3.rotation_exp(np.radians(np.array(turned_deg)))
     axis = scan_axis([sweep(turn, rings=rings)])
     assert axis is not None

@@ -39,7 +39,7 @@ def error_deg(estimate: Estimate, truth: Matrix4) -> float:
     return float(np.degrees(se3.rotation_angle_rad(estimate.optimum.T_camera_lidar @ se3.inverse(truth))))
 
 
-def test_the_pose_is_found_upside_down(street: Window, stereo: DepthModel) -> None:
+def test_the_pose_is_recovered_upside_down(street: Window, stereo: DepthModel) -> None:
     window = turned(street, UPSIDE_DOWN)
     estimate = solved(window, stereo)
     assert error_deg(estimate, window.rig.T_camera_lidar_nominal) < 0.5
@@ -69,7 +69,7 @@ def test_nothing_is_known_of_the_pose_before() -> None:
     assert log_prior(away, np.eye(4), inf) == 0.0
 
 
-def test_more_poses_ask_for_more_significance() -> None:
+def test_more_poses_need_more_significance() -> None:
     limits = [limit_for_more_poses(6.0, more) for more in (1.0, 100.0, 10_000.0)]
     assert limits == sorted(limits)
     assert limits[0] == 6.0
