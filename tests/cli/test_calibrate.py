@@ -48,16 +48,16 @@ def test_without_a_start_it_says_how_many_poses_were_weighed(coec: Coec, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [(("--perturb", "1,1,1"), "--perturb"), (("--objective", "mi"), "--objective fused"), ((), "")],
 )
 def test_no_start_cannot_be_moved_and_takes_the_fused_objective(
-    coec: Coec, arguments: tuple[str, ...], told: str
+    coec: Coec, arguments: tuple[str, ...], message: str
 ) -> None:
-    start = "none" if told else "nowhere"
+    start = "none" if message else "nowhere"
     outcome = coec("calibrate", SMALL, "--depth", "stereo", "--start", start, *arguments)
     assert outcome.status != 0
-    assert told in outcome.err
+    assert message in outcome.err
 
 
 def test_failed_verdict_is_1_and_still_a_document(coec: Coec) -> None:
