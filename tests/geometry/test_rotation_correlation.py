@@ -46,8 +46,8 @@ def test_a_point_lies_in_the_cell_in_whose_direction_it_is() -> None:
     grid, rng = RotationGrid(BANDWIDTH), np.random.default_rng(4)
     xyz = rng.normal(size=(500, 3)) * 10.0
     seen = xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
-    apart = np.arccos(np.clip(np.sum(seen * grid.directions[grid.cells(xyz)], axis=1), -1.0, 1.0))
-    assert apart.max() < np.pi / BANDWIDTH / 2.0
+    separation_rad = np.arccos(np.clip(np.sum(seen * grid.directions[grid.cells(xyz)], axis=1), -1.0, 1.0))
+    assert separation_rad.max() < np.pi / BANDWIDTH / 2.0
     assert grid.solid_angles.sum() == pytest.approx(4.0 * np.pi, rel=1e-2)
 
 
