@@ -101,6 +101,11 @@ class CalibrationOptions(SolverOptions, total=False):
     perturb: Annotated[str | Sequence[float] | None, Flag(typed=str, metavar="RX,RY,RZ[,TX,TY,TZ]")]
     """Move the start away from the recording's calibration: degrees about the camera axes, then metres along them."""
 
+    start: Annotated[Literal["recording", "none"] | None, Flag(shown="recording")]
+    """Where the search starts: at the recording's calibration, or none: no initial guess, any rotation. With --dof 3
+    the position of the camera in the LiDAR's frame stays that of the recording's calibration; with --dof 6 the camera
+    may be anywhere within 3 m of the LiDAR."""
+
     time_offset: Annotated[bool, Flag()]
     """Also estimate the offset of the camera's clock, if turns of the vehicle make it observable."""
 

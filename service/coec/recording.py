@@ -20,6 +20,7 @@ from coec.calibration import types as calibration
 from coec.calibration.frames.time_offset import TimeOffset, estimate_time_offset
 from coec.calibration.search.mistake_ranking import probable_mistake
 from coec.calibration.search.mistakes import CLOCK_OFFSET
+from coec.calibration.search.without_start import Weighed, calibrate_without_start, without_start
 from coec.calibration.solver import prepare_window_data
 from coec.calibration.uncertainty.systematic import require_fit
 from coec.calibration_options import CalibrationOptions, Progress, checked, configuration_of
@@ -97,6 +98,7 @@ class Solution:
         offset: offset of the camera's clock; None where it was not requested.
         mistake: probable mistake in the inputs, if the result was refused; else None.
         recognitions: what was recognised of the recording.
+        weighed: how many poses were weighed without a start; None if there was one.
     """
 
     window: calibration.Window
@@ -107,6 +109,7 @@ class Solution:
     offset: TimeOffset | None
     mistake: calibration.Mistake | None = None
     recognitions: tuple[calibration.Recognition, ...] = ()
+    weighed: Weighed | None = None
 
 
 class MistakenInputError(CalibrationError):
@@ -137,19 +140,39 @@ def solve(loaded: LoadedWindow, options: CalibrationOptions, progress: calibrati
     """
     configuration = configuration_of(options, options.get("configuration") or loaded.configuration)
     window, perturb, model = loaded.window, options.get("perturb"), options.get("camera_model")
-    if perturb is not None:
+    if _has_no_start(options):
+        window = without_start(window)
+    elif perturb is not None:
         window = window_cutting.with_perturbed_start(window, perturbation_of(perturb))
     window, fit = (window, None) if model is None else fit_camera(window, model)
     depth = open_depth(configuration.depth, LimitsConfig())
     progress.step("prepare", 1, 1)
     images = GreyImages(LimitsConfig())
-    estimate, mistake = calibrated(window, depth, images, configuration, progress)
+    mistake = weighed = None
+    if _has_no_start(options):
+        estimate, weighed = calibrate_without_start(window, depth, images, configuration, progress)
+    else:
+        estimate, mistake = calibrated(window, depth, images, configuration, progress)
     offset = None
     if options.get("time_offset"):
         offset = estimate_time_offset(window, images, estimate.optimum.T_camera_lidar, configuration)
         progress.step("time offset", 1, 1)
     result = result_of(estimate, window.rig, loaded.vehicle)
-    return Solution(window, estimate, result, configuration, fit, offset, mistake, loaded.recognitions)
+    return Solution(window, estimate, result, configuration, fit, offset, mistake, loaded.recognitions, weighed)
+
+
+def _has_no_start(options: CalibrationOptions) -> bool:
+    """Whether a search without a start is requested.
+
+    Raises:
+        UsageError: no such start, or one that is also to be moved.
+    """
+    start = options.get("start") or "recording"
+    if start not in ("recording", "none"):
+        raise UsageError(f"start {start}: known are recording, none")
+    if start == "none" and options.get("perturb") is not None:
+        raise UsageError("--start none has no start that --perturb could move: leave out one of the two")
+    return start == "none"
 
 
 def calibrated(
@@ -382,6 +405,11 @@ class Result:
         """Focal length, principal point and first radial term as the window has them, with standard deviations; None
         with an objective without edges, or if the edges determine no pose. Nothing applies it."""
         return self.document.lens
+
+    @property
+    def weighed(self) -> Weighed | None:
+        """How many poses were weighed without a start; None unless `start="none"`."""
+        return self._solution.weighed
 
     @property
     def time_offset(self) -> TimeOffset | None:

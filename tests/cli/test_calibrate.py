@@ -34,6 +34,32 @@ def test_recovers_the_truth_from_a_perturbed_start(coec: Coec) -> None:
     assert report["solved"] == [True, True, True, False, False, False]
 
 
+def test_without_a_start_it_says_how_many_poses_were_weighed(coec: Coec, tmp_path: Path) -> None:
+    outcome = coec("calibrate", SMALL, "--depth", "stereo", "--start", "none", "--output", tmp_path / "out")
+    report = json.loads((tmp_path / "out" / "result.json").read_text())
+    weighed = report["weighed"]
+    # Six coarse frames carry too little to choose among all rotations.
+    assert outcome.status == 1
+    assert report["verdict"]["decision"] == "failed"
+    assert weighed["rotations"] > weighed["ascended"] >= weighed["ranked"] >= weighed["solved"] > 0
+    sentence = f"without a start, {weighed['rotations']} rotations were weighed"
+    assert sentence in " ".join(outcome.out.split())
+    assert sentence in (tmp_path / "out" / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(("--perturb", "1,1,1"), "--perturb"), (("--objective", "mi"), "--objective fused"), ((), "")],
+)
+def test_no_start_cannot_be_moved_and_takes_the_fused_objective(
+    coec: Coec, arguments: tuple[str, ...], message: str
+) -> None:
+    start = "none" if message else "nowhere"
+    outcome = coec("calibrate", SMALL, "--depth", "stereo", "--start", start, *arguments)
+    assert outcome.status != 0
+    assert message in outcome.err
+
+
 def test_failed_verdict_is_1_and_still_a_document(coec: Coec) -> None:
     outcome = coec("calibrate", SMALL, "--depth", "stereo", "--perturb", "0,40,0", "--json")
     assert outcome.status == 1

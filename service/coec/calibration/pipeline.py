@@ -8,7 +8,7 @@ from coec.calibration import verdict
 from coec.calibration.frames.motion_compensation import compensation
 from coec.calibration.lens import estimate_lens
 from coec.calibration.search.change_point import change_point, moved_within
-from coec.calibration.solver import prepare_window_data, solve
+from coec.calibration.solver import EstimatorResult, WindowData, prepare_window_data, solve
 from coec.calibration.types import (
     MOVED,
     Compensation,
@@ -36,7 +36,12 @@ def calibrate(
     """
     # P_i and D_i, the objective of equation (1) and its maximum.
     data = prepare_window_data(window, depth, images, config, progress)
-    result = solve(data, config)
+    return estimate_of(solve(data, config), data, config)
+
+
+def estimate_of(result: EstimatorResult, data: WindowData, config: CalibrationConfig) -> Estimate:
+    """The estimate from what an estimator found in a window, with its uncertainty and verdict."""
+    window, progress = data.window, data.progress
     # How certain the window is of it, and along which axes.
     optimum = assess_optimum(result, data, config)
     # Self-diagnosis, equation (2).
@@ -76,9 +81,9 @@ def calibrate(
         solved=(axes < dof) & ~np.isin(axes, optimum.unobservable),
         unobservable=np.isin(axes, optimum.unobservable),
         compensation={outcome.value: outcomes[outcome] for outcome in Compensation},
-        depth_identity=depth.identity,
+        depth_identity=data.depth.identity,
         config_hash=config_hash(
-            config.objective, config.search, config.verdict, str(config.motion_compensation), depth.identity
+            config.objective, config.search, config.verdict, str(config.motion_compensation), data.depth.identity
         ),
         moved=moved,
         lens=estimate_lens(optimum.posterior, window.rig.camera),

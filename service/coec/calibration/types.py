@@ -271,7 +271,8 @@ class Window:
     """The pairs of one slice of sensor time, in order of their stamps, and the extrinsic that was current then.
 
     `T_camera_lidar_start` (4, 4) is where the search starts. It is part of the window so that a replay starts there
-    too. `start_known_to_rad` is how far it usually is from the truth: half a turn if it is a guess.
+    too. `start_known_to_rad` is how far it usually is from the truth: half a turn if it is a guess, infinite if there
+    is no start.
 
     `between` are further pairs of the slice, thinned, also in order of their stamps. They enter no estimate; if the
     camera moved between two pairs of the window, they tell when.

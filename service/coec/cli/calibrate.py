@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
@@ -121,6 +122,7 @@ def _show(solution: Solution, document: dict[str, Any], *, intrinsics: bool) -> 
         time_offset=document.get("time_offset"),
         mistake=document["mistake"],
         recognitions=document["recognitions"],
+        weighed=document["weighed"],
         elapsed_s=document["elapsed_s"],
         intrinsics=intrinsics,
     )
@@ -130,12 +132,15 @@ def _document(solution: Solution, elapsed_s: dict[str, float]) -> dict[str, Any]
     import numpy as np
 
     from coec.io.serialise import mistake_of
-    from coec.schemas.replies import CalibrationReport, Reason
+    from coec.schemas.replies import CalibrationReport, Reason, WeighedPoses
 
     fit, offset = solution.fit, solution.offset
+    weighed = None if solution.weighed is None else WeighedPoses(**asdict(solution.weighed))
     mistake = None if solution.mistake is None else mistake_of(solution.mistake)
     recognised = tuple(Reason(code=one.code, text=one.text) for one in solution.recognitions)
-    report = CalibrationReport(**dict(solution.result), elapsed_s=elapsed_s, mistake=mistake, recognitions=recognised)
+    report = CalibrationReport(
+        **dict(solution.result), elapsed_s=elapsed_s, mistake=mistake, recognitions=recognised, weighed=weighed
+    )
     document: dict[str, Any] = report.model_dump(mode="json")
     if fit is not None:
         document["camera_fit"] = {
@@ -181,7 +186,7 @@ def _write(
 
     window, result, compensated = solution.window, solution.result, solution.configuration.motion_compensation
     caption = Caption(
-        before="start",
+        before="start" if solution.weighed is None else "recording",
         after=f"result ({result.verdict.decision})",
         covariance=solution.estimate.uncertainty.covariance,
         network=pictures.network_text(solution.configuration.depth.model, result.depth_identity),
@@ -197,7 +202,11 @@ def _write(
     report = CalibrationReport.model_validate(document)
     written = files.write_output(folder / "result.json", to_json(report))
     remarks = calibration.remarks(
-        document.get("camera_fit"), document.get("time_offset"), document["mistake"], document["recognitions"]
+        document.get("camera_fit"),
+        document.get("time_offset"),
+        document["mistake"],
+        document["recognitions"],
+        document["weighed"],
     )
     of_result = calibration_page(
         report, window, calibration.start_of(window), blocks, remarks, Provenance.here(), intrinsics=intrinsics

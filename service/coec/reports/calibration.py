@@ -1,6 +1,7 @@
 """The result of `coec calibrate`: on the console, and as a page."""
 
 from collections.abc import Mapping, Sequence
+from math import isinf
 from pathlib import Path
 from typing import Any, cast
 
@@ -40,6 +41,7 @@ def show(
     time_offset: Mapping[str, Any] | None,
     mistake: Mapping[str, Any] | None,
     recognitions: Sequence[Mapping[str, Any]],
+    weighed: Mapping[str, int] | None = None,
     elapsed_s: Mapping[str, float],
     intrinsics: bool = False,
 ) -> None:
@@ -51,6 +53,7 @@ def show(
         camera_fit, time_offset: as `--json` has them; None: not asked for.
         mistake: in the inputs, as `--json` has it; None: none was found.
         recognitions: of the recording, as `--json` has them.
+        weighed: poses without a start, as `--json` has them; None: there was a start.
         elapsed_s: seconds by stage.
         intrinsics: whether the lens is shown, too.
     """
@@ -72,7 +75,7 @@ def show(
         console.show(
             "the field `ring` holds one number and was ignored: beams were told apart by their elevation", "yellow"
         )
-    for note in remarks(camera_fit, time_offset, None, recognitions):
+    for note in remarks(camera_fit, time_offset, None, recognitions, weighed):
         console.show(note)
     if result.independent_looks is not None:
         console.show(
@@ -89,9 +92,15 @@ def remarks(
     time_offset: Mapping[str, Any] | None,
     mistake: Mapping[str, Any] | None = None,
     recognitions: Sequence[Mapping[str, Any]] = (),
+    weighed: Mapping[str, int] | None = None,
 ) -> list[str]:
     """What else was found out, one sentence each; all arguments as `--json` has them, None: not asked for, or none."""
     sentences = [str(one["text"]) for one in (*([] if mistake is None else [mistake]), *recognitions)]
+    if weighed is not None:
+        sentences.append(
+            f"without a start, {weighed['rotations']} rotations were weighed: {weighed['ascended']} maxima climbed, "
+            f"{count(weighed['ranked'], 'basin')} ranked by edges and depth, {weighed['solved']} solved"
+        )
     if camera_fit is not None:
         sentences.append(
             f"{camera_fit['model']} fitted to {camera_fit['of']}: {camera_fit['residual_rms_px']:.4f} px rms, "
@@ -102,8 +111,11 @@ def remarks(
     return sentences
 
 
-def start_of(window: Window) -> Vector6:
-    """Start of a window's search, relative to the recording's own calibration: rx ry rz (deg), tx ty tz (m)."""
+def start_of(window: Window) -> Vector6 | None:
+    """Start of a window's search, relative to the recording's own calibration: rx ry rz (deg), tx ty tz (m); None
+    without a start."""
+    if isinf(window.start_known_to_rad):
+        return None
     start = se3.difference(window.T_camera_lidar_start, window.rig.T_camera_lidar_nominal)
     start[:3] = np.degrees(start[:3])
     return cast("Vector6", tuple(float(value) for value in start))
@@ -162,7 +174,8 @@ def _show_axes(window: Window, result: CalibrationResult) -> None:
         unsolved = "not observable" if result.unobservable[axis] else "not searched"
         correction = console.figure(result.correction[axis], sign=True) if result.solved[axis] else unsolved
         spread = console.figure(result.sigma[axis]) if result.solved[axis] else ""
-        axes.add_row(name, console.figure(start[axis], sign=True), correction, spread, console.UNITS[axis])
+        began = "none" if start is None else console.figure(start[axis], sign=True)
+        axes.add_row(name, began, correction, spread, console.UNITS[axis])
     console.out.print(axes)
 
 
@@ -226,7 +239,7 @@ USE = (
 def calibration_page(
     report: CalibrationReport,
     window: Window,
-    start: Vector6,
+    start: Vector6 | None,
     pictures: Sequence[Block],
     remarks: Sequence[str],
     made: page_parts.Provenance,
@@ -236,7 +249,7 @@ def calibration_page(
     """The page of a result.
 
     Args:
-        start: of the search, relative to the recording's own calibration: rx ry rz (deg), tx ty tz (m).
+        start: of the search, relative to the recording's own calibration: rx ry rz (deg), tx ty tz (m); None without.
         pictures: of the result.
         remarks: what else was found out, one sentence each.
         intrinsics: whether the lens has a section.
@@ -299,7 +312,7 @@ def _known_to(report: CalibrationResult) -> str:
     )
 
 
-def _axes(report: CalibrationReport, start: Vector6) -> AxesTable:
+def _axes(report: CalibrationReport, start: Vector6 | None) -> AxesTable:
     unsolved_labels = {
         axis: "not observable" if report.unobservable[axis] else "not searched"
         for axis, solved in enumerate(report.solved)
@@ -312,7 +325,7 @@ def _axes(report: CalibrationReport, start: Vector6) -> AxesTable:
         report.correction,
         report.sigma,
         unsolved_labels,
-        {"Search began at": [page_parts.axis_value(value, axis) for axis, value in enumerate(start)]},
+        {} if start is None else {"Search began at": [page_parts.axis_value(v, axis) for axis, v in enumerate(start)]},
     )
 
 

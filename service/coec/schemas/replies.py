@@ -247,6 +247,15 @@ class ProbableMistake(Part):
     significance_as_given: float | None = Field(description="the same for the inputs as they are")
 
 
+class WeighedPoses(Part):
+    """How many poses a calibration without an initial guess weighed."""
+
+    rotations: int = Field(description="rotations that were compared, with enough of the cloud in view")
+    ascended: int = Field(description="local maxima among them that were followed to finer edges")
+    ranked: int = Field(description="of these, ranked by edges and depth together")
+    solved: int = Field(description="of these, solved as from a start")
+
+
 class CalibrationReport(CalibrationResult):
     """What `coec calibrate --json` prints: the result and how long it took."""
 
@@ -256,6 +265,9 @@ class CalibrationReport(CalibrationResult):
     )
     recognitions: tuple[Reason, ...] = Field(
         default=(), description="how the recording was read where its values show more than its fields"
+    )
+    weighed: WeighedPoses | None = Field(
+        default=None, description="poses that were weighed without an initial guess; null: there was a start"
     )
 
 

@@ -127,7 +127,7 @@ def find_basins(edges: EdgeCue, start: Matrix4, reach: SearchBox) -> list[Basin]
         poses, z = _pattern_searched(charts, poses, number, start, reach)
     for _ in range(SHIFT_TURNS if reach.translation_m > 0.0 else 0):
         best = _separated(poses, z, SHIFTED_POSES, ROUNDS[-1].separation_rad)
-        more, _ = _pattern_searched(finest, _shifted(poses[best]), SHIFTED, start, reach)
+        more, _ = _pattern_searched(finest, shifted(poses[best], SHIFT_M), SHIFTED, start, reach)
         poses, z = np.concatenate([poses, more]), np.concatenate([z, charted_significances(finest, more)])
     z = charted_significances(finest, poses)
     return [Basin(poses[k], float(z[k])) for k in _separated(poses, z, len(poses), ROUNDS[-1].separation_rad)]
@@ -180,11 +180,11 @@ def _promising(charts: EdgeCharts, start: Matrix4, reach: SearchBox) -> NDArray[
     return poses[_separated(poses, z, ROUNDS[0].poses, ROUNDS[0].separation_rad)]
 
 
-def _shifted(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def shifted(poses: NDArray[np.float64], shift_m: float) -> NDArray[np.float64]:
     """(10·K, 4, 4) the poses (K, 4, 4), each shifted either way along each camera axis, and sideways and upwards also
     with the turn that makes up for it."""
-    turn_rad = SHIFT_M / TURNED_FOR_M
-    x, y, z = SHIFT_M * np.eye(6)[3:]
+    turn_rad = shift_m / TURNED_FOR_M
+    x, y, z = shift_m * np.eye(6)[3:]
     one_way = np.array([x, x - turn_rad * np.eye(6)[1], y, y + turn_rad * np.eye(6)[0], z])
     return np.array([se3.perturb(pose, step) for pose in poses for step in (*one_way, *-one_way)])
 
