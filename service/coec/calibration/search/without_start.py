@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.frames.scan_axis import upright_turn, with_turned_clouds
 from coec.calibration.objective import mutual_information
-from coec.calibration.objective.edges import EdgeCue, build_edges
+from coec.calibration.objective.edges import RANGE, EdgeCue, build_edges
 from coec.calibration.objective.fused import Fusion
 from coec.calibration.objective.mutual_information import SearchBox
 from coec.calibration.pipeline import estimate_of
@@ -129,7 +129,8 @@ def _solve(data: WindowData, config: CalibrationConfig) -> tuple[EstimatorResult
     place_m = se3.inverse(window.T_camera_lidar_start)[:3, 3] if turns_only else np.zeros(3)
     # No axis of the LiDAR has a known direction in the image.
     rig = replace(window.rig, T_camera_lidar_nominal=np.eye(4))
-    edges = build_edges(window.pairs, data.points, data.greys(), rig)
+    # Over all rotations, rows of paint and joints fit many poses; silhouettes, where there are any, fit few.
+    edges = build_edges(window.pairs, data.points, data.greys(), rig).kinds_alone[RANGE]
     basins = find_free_basins(edges, place_m, turns_only=turns_only)
     data.progress.step("basins", 1, 1)
     search = config.search
