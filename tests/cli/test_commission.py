@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 Coec = Callable[..., Any]
@@ -23,16 +24,22 @@ def test_one_check_at_a_right_and_at_a_wrong_extrinsic(coec: Coec, tmp_path: Pat
     assert right.document["flagged_by_paper"] is None
     assert right.document["drift"] is None
     assert [len(right.document[name]) for name in ("first_derivative", "second_derivative")] == [6, 6]
-    wrong = coec("diagnose", RIG, "--depth", "stereo", "--perturb", "2,-2,1", "--json", "--output", tmp_path)
+    assert right.document["measured"] is None
+    moved = ("--depth", "stereo", "--perturb", "2,-2,1", "--json")
+    wrong = coec("diagnose", f"{RIG}&intensity=none", *moved, "--output", tmp_path)
     assert wrong.status == 1
     assert wrong.document["flagged"]
     assert wrong.document["metrics"]["distance_rotation"]["value"] > 1.0
-    # Eight small frames tell that it moved, and not surely how far.
+    # The range edges of eight small frames tell that it moved, and not surely how far.
     assert wrong.document["measured"]["pairs"] == 8
     assert not wrong.document["measured"]["accepted"]
     assert wrong.document["measured"]["reasons"]
     assert "±" not in wrong.document["text"]
-    assert right.document["measured"] is None
+    # With those of reflectance they tell how far.
+    measured = coec("diagnose", RIG, *moved).document["measured"]
+    assert measured["accepted"]
+    error = np.subtract(measured["offset"][:3], [-2.0, 2.0, -1.0])
+    assert (np.abs(error) < 3.0 * np.array(measured["sigma"][:3])).all()
     page = (tmp_path / "report.html").read_text()
     assert "the camera is not where this extrinsic has it" in page
     assert page.count("data:image/") == 1

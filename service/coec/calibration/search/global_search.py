@@ -127,7 +127,8 @@ def find_basins(edges: EdgeCue, start: Matrix4, reach: SearchBox) -> list[Basin]
         poses, z = _pattern_searched(charts, poses, number, start, reach)
     for _ in range(SHIFT_TURNS if reach.translation_m > 0.0 else 0):
         best = _separated(poses, z, SHIFTED_POSES, ROUNDS[-1].separation_rad)
-        more, _ = _pattern_searched(finest, shifted(poses[best], SHIFT_M), SHIFTED, start, reach)
+        beside = _within(shifted(poses[best], SHIFT_M), start, reach)
+        more, _ = _pattern_searched(finest, beside, SHIFTED, start, reach)
         poses, z = np.concatenate([poses, more]), np.concatenate([z, charted_significances(finest, more)])
     z = charted_significances(finest, poses)
     return [Basin(poses[k], float(z[k])) for k in _separated(poses, z, len(poses), ROUNDS[-1].separation_rad)]
@@ -187,6 +188,12 @@ def shifted(poses: NDArray[np.float64], shift_m: float) -> NDArray[np.float64]:
     x, y, z = shift_m * np.eye(6)[3:]
     one_way = np.array([x, x - turn_rad * np.eye(6)[1], y, y + turn_rad * np.eye(6)[0], z])
     return np.array([se3.perturb(pose, step) for pose in poses for step in (*one_way, *-one_way)])
+
+
+def _within(poses: NDArray[np.float64], start: Matrix4, reach: SearchBox) -> NDArray[np.float64]:
+    """Those of some poses (K, 4, 4) whose shift is within the reach."""
+    unmoved_m = np.einsum("kij,j->ki", poses[:, :3, :3], se3.inverse(start)[:3, 3])
+    return poses[np.linalg.norm(poses[:, :3, 3] + unmoved_m, axis=1) <= reach.translation_m]
 
 
 def _pattern_searched(
