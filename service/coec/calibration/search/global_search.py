@@ -193,7 +193,7 @@ def shifted(poses: NDArray[np.float64], shift_m: float) -> NDArray[np.float64]:
 def _within(poses: NDArray[np.float64], start: Matrix4, reach: SearchBox) -> NDArray[np.float64]:
     """Those of some poses (K, 4, 4) whose shift is within the reach."""
     unmoved_m = np.einsum("kij,j->ki", poses[:, :3, :3], se3.inverse(start)[:3, 3])
-    return poses[np.linalg.norm(poses[:, :3, 3] + unmoved_m, axis=1) <= reach.translation_m]
+    return np.asarray(poses[np.linalg.norm(poses[:, :3, 3] + unmoved_m, axis=1) <= reach.translation_m])
 
 
 def _pattern_searched(
