@@ -127,8 +127,8 @@ def find_basins(edges: EdgeCue, start: Matrix4, reach: SearchBox) -> list[Basin]
         poses, z = _pattern_searched(charts, poses, number, start, reach)
     for _ in range(SHIFT_TURNS if reach.translation_m > 0.0 else 0):
         best = _separated(poses, z, SHIFTED_POSES, ROUNDS[-1].separation_rad)
-        beside = _within(shifted(poses[best], SHIFT_M), start, reach)
-        more, _ = _pattern_searched(finest, beside, SHIFTED, start, reach)
+        moved = _within(shifted(poses[best], SHIFT_M), start, reach)
+        more, _ = _pattern_searched(finest, moved, SHIFTED, start, reach)
         poses, z = np.concatenate([poses, more]), np.concatenate([z, charted_significances(finest, more)])
     z = charted_significances(finest, poses)
     return [Basin(poses[k], float(z[k])) for k in _separated(poses, z, len(poses), ROUNDS[-1].separation_rad)]
