@@ -7,19 +7,19 @@ searched. Nothing is random: the same input gives the same basins.
 """
 
 from dataclasses import dataclass
-from math import cos, pi, radians
+from math import pi, radians
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.objective.edges import EdgeCue
-from coec.calibration.search.global_search import COARSE, FINE, shifted
+from coec.calibration.search.global_search import COARSE, FINE, separated, shifted
 from coec.geometry import se3
 from coec.geometry.cameras import in_image
 from coec.geometry.edges.alignment import EdgeFrames
-from coec.geometry.edges.charts import EdgeCharts, charted_significances, pattern_search, select_separated
+from coec.geometry.edges.charts import charted_significances, pattern_search
 from coec.geometry.edges.image_edges import VOID
-from coec.geometry.points import lengths, thinned
+from coec.geometry.points import lengths
 from coec.geometry.projection import project
 from coec.geometry.rotation_correlation import RotationGrid, local_maxima
 
@@ -98,21 +98,22 @@ def find_free_basins(edges: EdgeCue, place_m: NDArray[np.float64], *, turns_only
     centre[:3, 3] = -place_m
     z = np.zeros(len(poses))
     for number in ROUNDS:
-        charts, best = _at_most(edges.charts[number.chart], number.points), np.arange(len(poses))
+        charts, best = edges.charts[number.chart].at_most(number.points), np.arange(len(poses))
         if number is not ROUNDS[0]:
             # A maximum may lie so far from its rotation of the grid that it does not show on the chart there.
-            best = _separated(poses, charted_significances(charts, poses), number)
+            best = separated(poses, charted_significances(charts, poses), number.poses, number.separation_rad)
         steps = se3.axis_steps(number.step_rad)
         steps[3:] = 0.0 if turns_only else steps[3:]
         poses, z = pattern_search(charts, poses[best], steps, number.halvings, centre, reach)
         for shift_m in () if turns_only or number.chart == COARSE else SHIFTS_M:
-            best = _separated(poses, z, SHIFTED)
+            best = separated(poses, z, SHIFTED.poses, SHIFTED.separation_rad)
             more, _ = pattern_search(
-                _at_most(charts, SHIFTED.points), shifted(poses[best], shift_m), steps, number.halvings, centre, reach
+                charts.at_most(SHIFTED.points), shifted(poses[best], shift_m), steps, number.halvings, centre, reach
             )
             poses = np.concatenate([poses, more])
             z = charted_significances(charts, poses)
-    return FreeBasins(poses[_separated(poses, z, ROUNDS[-1])], rotations, ascended)
+    best = separated(poses, z, ROUNDS[-1].poses, ROUNDS[-1].separation_rad)
+    return FreeBasins(poses[best], rotations, ascended)
 
 
 def _edges_on_sphere(frames: EdgeFrames, grid: RotationGrid) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
@@ -159,13 +160,5 @@ def _correlated(
     poses = np.tile(np.eye(4), (len(maxima), 1, 1))
     poses[:, :3, :3] = grid.rotations(maxima)
     poses[:, :3, 3] = -np.einsum("kij,j->ki", poses[:, :3, :3], place_m)
-    return poses[_separated(poses, -np.arange(len(poses), dtype=np.float64), ROUNDS[0])], int(enough.sum())
-
-
-def _at_most(charts: EdgeCharts, points: int) -> EdgeCharts:
-    return charts.of_points(thinned(len(charts.weight), points))
-
-
-def _separated(poses: NDArray[np.float64], z: NDArray[np.float64], number: _Round) -> NDArray[np.int64]:
-    order = np.argsort(-z, kind="stable")
-    return np.asarray(select_separated(poses, order, number.poses, 1.0 + 2.0 * cos(number.separation_rad)))
+    descending = -np.arange(len(poses), dtype=np.float64)
+    return poses[separated(poses, descending, ROUNDS[0].poses, ROUNDS[0].separation_rad)], int(enough.sum())

@@ -24,7 +24,6 @@ from coec.geometry.edges.charts import (
     select_separated,
     unit_ball,
 )
-from coec.geometry.points import thinned
 
 COVER_RAD = radians(0.9)
 """Distance between the poses of the cover: less than the blur of the coarsest level on common lenses."""
@@ -123,15 +122,15 @@ def find_basins(edges: EdgeCue, start: Matrix4, reach: SearchBox) -> list[Basin]
     poses = _promising(thinned_to[ROUNDS[0].chart], start, reach)
     for number in ROUNDS:
         charts = thinned_to[number.chart] if number.thinned else finest
-        poses = poses[_separated(poses, charted_significances(charts, poses), number.poses, number.separation_rad)]
+        poses = poses[separated(poses, charted_significances(charts, poses), number.poses, number.separation_rad)]
         poses, z = _pattern_searched(charts, poses, number, start, reach)
     for _ in range(SHIFT_TURNS if reach.translation_m > 0.0 else 0):
-        best = _separated(poses, z, SHIFTED_POSES, ROUNDS[-1].separation_rad)
+        best = separated(poses, z, SHIFTED_POSES, ROUNDS[-1].separation_rad)
         moved = _within(shifted(poses[best], SHIFT_M), start, reach)
         more, _ = _pattern_searched(finest, moved, SHIFTED, start, reach)
         poses, z = np.concatenate([poses, more]), np.concatenate([z, charted_significances(finest, more)])
     z = charted_significances(finest, poses)
-    return [Basin(poses[k], float(z[k])) for k in _separated(poses, z, len(poses), ROUNDS[-1].separation_rad)]
+    return [Basin(poses[k], float(z[k])) for k in separated(poses, z, len(poses), ROUNDS[-1].separation_rad)]
 
 
 def basin_next_to(edges: EdgeCue, pose: Matrix4, reach: SearchBox) -> Matrix4:
@@ -169,7 +168,7 @@ def _promising(charts: EdgeCharts, start: Matrix4, reach: SearchBox) -> NDArray[
     count = int(min(max(volume, MIN_COVER), MAX_COVER))
     cover = _Cover(start, reach, count)
     blocks = np.array_split(np.arange(count), -(-count // BLOCK))
-    screen = _at_most(charts, SCREENING_POINTS)
+    screen = charts.at_most(SCREENING_POINTS)
     z = np.concatenate([charted_significances(screen, cover.poses(block)) for block in blocks])
     best = np.flatnonzero(z >= np.partition(z, -min(CANDIDATES, count))[-min(CANDIDATES, count)])
     # Filled in place, because a second copy of all poses would be the peak of memory of a solve.
@@ -178,7 +177,7 @@ def _promising(charts: EdgeCharts, start: Matrix4, reach: SearchBox) -> NDArray[
     for begin in range(0, len(best), BLOCK):
         poses[1 + begin : 1 + begin + BLOCK] = cover.poses(best[begin : begin + BLOCK])
     z = charted_significances(charts, poses)
-    return poses[_separated(poses, z, ROUNDS[0].poses, ROUNDS[0].separation_rad)]
+    return poses[separated(poses, z, ROUNDS[0].poses, ROUNDS[0].separation_rad)]
 
 
 def shifted(poses: NDArray[np.float64], shift_m: float) -> NDArray[np.float64]:
@@ -202,18 +201,14 @@ def _pattern_searched(
     steps = se3.axis_steps(number.step_rad)
     if reach.translation_m == 0.0:
         steps[3:] = 0.0
-    few = _at_most(charts, number.points)
+    few = charts.at_most(number.points)
     return pattern_search(
         few, poses, steps, number.halvings, start, np.array([reach.rotation_rad, reach.translation_m])
     )
 
 
-def _at_most(charts: EdgeCharts, points: int) -> EdgeCharts:
-    return charts.of_points(thinned(len(charts.weight), points))
-
-
-def _separated(
+def separated(
     poses: NDArray[np.float64], z: NDArray[np.float64], count: int, separation_rad: float
 ) -> NDArray[np.int64]:
-    """Indices of the best poses, best first, no two closer in rotation than `apart_rad`."""
+    """Indices of the best poses, best first, no two closer in rotation than `separation_rad`."""
     return np.asarray(select_separated(poses, np.argsort(-z, kind="stable"), count, 1.0 + 2.0 * cos(separation_rad)))

@@ -153,10 +153,7 @@ def _solve(data: WindowData, config: CalibrationConfig) -> tuple[EstimatorResult
 def _shortlist(edges: EdgeCue, poses: NDArray[np.float64], reach: SearchBox) -> NDArray[np.float64]:
     """The basins (K, 4, 4) that stand out most among the poses about them."""
     about = np.concatenate([np.concatenate([pose[None], sample_reach(pose, reach, OTHER_POSES)]) for pose in poses])
-    of_charts = [
-        charted_significances(charts.of_points(thinned(len(charts.weight), SHORTLIST_POINTS)), about)
-        for charts in edges.charts
-    ]
+    of_charts = [charted_significances(charts.at_most(SHORTLIST_POINTS), about) for charts in edges.charts]
     z = np.mean(of_charts, axis=0).reshape(len(poses), -1)
     contrast = (z[:, 0] - z[:, 1:].mean(axis=1)) / np.maximum(z[:, 1:].std(axis=1), 1e-9)
     return np.asarray(poses[np.argsort(-contrast, kind="stable")[:SHORTLISTED]])

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from coec.geometry.cameras import Camera
 from coec.geometry.compiler import PRANGE, njit, prange
 from coec.geometry.edges.image_edges import STRENGTH_STEPS, VOID
+from coec.geometry.points import thinned
 from coec.geometry.projection import NOT_IN_IMAGE, exact_pixel, unproject
 
 CELLS_PER_BLUR = 2.5
@@ -70,6 +71,10 @@ class EdgeCharts:
         """The charts with only the range edges of the given indices."""
         xyz_m = np.ascontiguousarray(self.xyz_m[:, index])
         return replace(self, xyz_m=xyz_m, weight=self.weight[index], first_cell=self.first_cell[index])
+
+    def at_most(self, points: int) -> EdgeCharts:
+        """The charts with at most so many of the edges, each chosen with the same probability."""
+        return self.of_points(thinned(len(self.weight), points))
 
 
 def edge_charts(
