@@ -84,12 +84,16 @@ POLISHED_ALIKE = 3
 """At most this many polishes, that of the start included, may end in one basin: further ones come to the same end. See
 docs/measured.md."""
 
+CLEAR, STANDING_ALONE = 5.0, 0.4
+"""A basin of range edges stands alone if both kinds of edges have at least this contrast there, standard deviations,
+and all basins beyond its neighbourhood at most this share of its contrast. See docs/measured.md."""
+
 PLAUSIBLE = 0.5
 """A basin, or the neighbourhood of the start, is polished if it has at least this share of the best rank. A polish adds
 a tenth to a rank, a quarter at most; a rank half as high as the best would have to double."""
 
 NEIGHBOURHOOD_RAD = radians(5.0)
-"""Radius of the neighbourhood of the start."""
+"""Radius of the neighbourhood of a pose: polishes lead there from anywhere within it."""
 
 SETTLED_POSES = 2
 """How many poses of the best basin are settled. One is not enough: with six degrees of freedom, blurred edges can lead
@@ -251,18 +255,18 @@ def by_fusion(data: WindowData, config: CalibrationConfig) -> EstimatorResult:
     edges = build_edges(window.pairs, data.points, data.greys(), window.rig)
     features = depth_features(data, start, LEADING_DEPTH_POINTS)
     depth = mutual_information.build_mutual_information(features, window.rig, start, reach, config.objective)
-    # Each kind of edges by itself: those that fit nothing hide no basin of the others.
-    basins = [basin for cue in edges.kinds_alone for basin in find_basins(cue, start, reach)]
-    data.progress.step("basins", 1, 1)
     fusion = Fusion(edges, depth, start, reach)
-    ranked = rank_basins(fusion, [basin.T_camera_lidar for basin in basins])
+    basins = basins_of_each_kind(fusion)
+    data.progress.step("basins", 1, 1)
+    ranked = rank_basins(fusion, basins)
     polished = polish_basins(fusion, ranked, config.search, data.progress)
     summits = choose_basin(fusion, polished, window)
-    fusion = fusion.balanced_at(summits[0])
-    metrics = basin_metrics(fusion, polished, summits[0], config)
-    objective, search = settle_basin(fusion, summits, polished.evaluations, data, config)
-    cues = objective.cue_shares(fusion.edges, search.T_camera_lidar, config.search.dof)
-    return EstimatorResult(objective, search, metrics, fusion.edges, cues)
+    edges = edges.balanced_at(summits[0])
+    count = Metric("range_edges", edges.effective_count, least_range_edges(config), at_least=True)
+    metrics = (count, *basin_metrics(fusion, polished, summits[0], config))
+    objective, search = settle_basin(fusion, edges, summits, polished.evaluations, data, config)
+    cues = objective.cue_shares(edges, search.T_camera_lidar, config.search.dof)
+    return EstimatorResult(objective, search, metrics, edges, cues)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -301,6 +305,25 @@ class PolishedBasins:
     ends: tuple[RankedPose, ...]
     implausible: tuple[Matrix4, ...]
     evaluations: int
+
+
+def basins_of_each_kind(fusion: Fusion) -> list[Matrix4]:
+    """Poses (4, 4) of the basins of each kind of edges by itself, so that those of one kind that fit nothing hide no
+    basin of the other. Once a basin stands alone to both kinds, no further kind is searched."""
+    poses: list[Matrix4] = []
+    for cue in fusion.edges.kinds_alone:
+        if poses and _has_one_that_stands_alone(fusion, poses):
+            break
+        poses.extend(basin.T_camera_lidar for basin in find_basins(cue, fusion.start, fusion.reach))
+    return poses
+
+
+def _has_one_that_stands_alone(fusion: Fusion, poses: Sequence[Matrix4]) -> bool:
+    of_kinds = np.maximum(fusion.contrasts_by_kind(np.array(poses)), 0.0)
+    contrast = np.sqrt((of_kinds**2).sum(axis=0))
+    best = int(np.argmax(contrast))
+    far = [_angle_rad(pose, poses[best]) > NEIGHBOURHOOD_RAD for pose in poses]
+    return bool(of_kinds[:, best].min() >= CLEAR and contrast[far].max(initial=0.0) <= STANDING_ALONE * contrast[best])
 
 
 def rank_basins(fusion: Fusion, basins: Sequence[Matrix4]) -> RankedBasins:
@@ -361,19 +384,23 @@ def basin_metrics(
     rival = _best_rival(fusion, [other for other in others if _differ(other, pose)], pose)
     limits = config.verdict
     return (
-        Metric("range_edges", fusion.edges.effective_count, least_range_edges(config), at_least=True),
         Metric("edge_contrast", contrast, limits.min_edge_contrast, at_least=True),
         Metric("runner_up", runner_up(contrast, rival), limits.max_runner_up, at_least=False),
     )
 
 
 def settle_basin(
-    fusion: Fusion, summits: Sequence[Matrix4], evaluations: int, data: WindowData, config: CalibrationConfig
+    fusion: Fusion,
+    edges: EdgeCue,
+    summits: Sequence[Matrix4],
+    evaluations: int,
+    data: WindowData,
+    config: CalibrationConfig,
 ) -> tuple[FusedObjective, SearchResult]:
-    """The objective on the sharpest edges, and its highest summit in the basin of some poses (4, 4). `evaluations` were
-    made before and are included in the result."""
+    """The objective on the sharpest edges, balanced in the basin of some poses (4, 4), and its highest summit in that
+    basin. `evaluations` were made before and are included in the result."""
     highest = summits[0]
-    leading, finest = fusion.settling
+    leading, finest = fusion.settling(edges)
     if fusion.depth_contrast(highest) >= TELLING:
         finest = finest.with_depth(_denser(data, fusion.depth, highest, config))
     settled = [
@@ -512,4 +539,8 @@ def _by_mutual_information(
 
 
 def _differ(a: Matrix4, b: Matrix4) -> bool:
-    return se3.rotation_angle_rad(a @ se3.inverse(b)) > SAME_BASIN_RAD
+    return _angle_rad(a, b) > SAME_BASIN_RAD
+
+
+def _angle_rad(a: Matrix4, b: Matrix4) -> float:
+    return se3.rotation_angle_rad(a @ se3.inverse(b))

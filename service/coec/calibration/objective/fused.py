@@ -171,11 +171,9 @@ class Fusion:
         reach: the half-widths of the search.
         ranking: the objectives on which a basin is polished in turn before it is ranked. The coarsest band is not among
             them, because the charts have settled it.
-        settling: the objectives on which the best basin is polished in turn at the end.
     """
 
     ranking: tuple[FusedObjective, ...]
-    settling: tuple[FusedObjective, FusedObjective]
 
     def __init__(
         self,
@@ -188,32 +186,29 @@ class Fusion:
         poses = sample_reach(start, reach, OTHER_POSES)
         self._of_depth = Scale.of(np.array([at.score for at in depth.evaluate_each(poses)]))
         of_edges = replace(reach, rotation_rad=max(reach.rotation_rad, OTHER_POSES_RAD))
-        poses = sample_reach(start, of_edges, OTHER_POSES)
-        seen = mutual_information.SearchBox(
+        self._poses = poses = sample_reach(start, of_edges, OTHER_POSES)
+        self._seen = mutual_information.SearchBox(
             of_edges.rotation_rad + BEYOND.rotation_rad, of_edges.translation_m + BEYOND.translation_m
         )
-
-        def visible(cue: EdgeCue) -> tuple[alignment.EdgeFrames, ...]:
-            return tuple(in_reach(band, edges.half_view_rad, start, seen) for band in cue.bands)
-
-        self._bands, self._of_bands = visible(edges), _scale_of_bands(edges, poses)
-        self._kinds = [(visible(cue), _scale_of_bands(cue, poses)) for cue in edges.kinds_alone]
+        self._kinds = [(self._visible(*cue.bands), _scale_of_bands(cue, poses)) for cue in edges.kinds_alone]
+        of_bands = _scale_of_bands(edges, poses)
         self.ranking = tuple(
-            FusedObjective(band, blur_rad, depth, self._of_bands, self._of_depth)
-            for band, blur_rad in reversed(list(zip(self._bands[:-1], edges.band_blur_rad[:-1], strict=True)))
-        )
-        whole, sharp = (in_reach(level, edges.half_view_rad, start, seen) for level in (edges.whole, edges.sharp))
-        of_whole, of_sharp = (Scale.of(alignment.significances(level, poses)) for level in (whole, sharp))
-        self.settling = (
-            FusedObjective(whole, edges.blur_rad, depth, of_whole, self._of_depth),
-            FusedObjective(sharp, edges.blur_rad, depth, of_sharp, self._of_depth),
+            FusedObjective(band, blur_rad, depth, of_bands, self._of_depth)
+            for band, blur_rad in zip(self._visible(*edges.bands[-2::-1]), edges.band_blur_rad[-2::-1], strict=True)
         )
 
-    def balanced_at(self, T_camera_lidar: Matrix4) -> Fusion:
-        """The same witnesses, with edges of range and of reflectance weighted by what each is worth at a pose (4, 4);
-        see `EdgeCue.balanced_at`."""
-        edges = self.edges.balanced_at(T_camera_lidar)
-        return self if edges is self.edges else Fusion(edges, self.depth, self.start, self.reach)
+    def settling(self, edges: EdgeCue) -> tuple[FusedObjective, FusedObjective]:
+        """The objectives on which the best basin is polished in turn at the end: `edges` are those of this fusion,
+        balanced at its pose (`EdgeCue.balanced_at`)."""
+        whole, sharp = self._visible(edges.whole, edges.sharp)
+        of_whole, of_sharp = (Scale.of(alignment.significances(level, self._poses)) for level in (whole, sharp))
+        return (
+            FusedObjective(whole, edges.blur_rad, self.depth, of_whole, self._of_depth),
+            FusedObjective(sharp, edges.blur_rad, self.depth, of_sharp, self._of_depth),
+        )
+
+    def _visible(self, *levels: alignment.EdgeFrames) -> tuple[alignment.EdgeFrames, ...]:
+        return tuple(in_reach(level, self.edges.half_view_rad, self.start, self._seen) for level in levels)
 
     def edge_contrasts(self, poses: NDArray[np.float64]) -> list[float]:
         """How far the edge witness, averaged over its bands, stands above other poses at each of K poses (K, 4, 4);

@@ -27,6 +27,7 @@ from coec.geometry.edges.scan_lines import (
     SweepEdges,
     turned_about_the_axis,
 )
+from coec.geometry.points import thinned
 
 SMOOTH_M, SMOOTH_SHARE = 0.05, 0.02
 """Largest spread of the ranges of five neighbours on one surface: in metres, plus a share of the range."""
@@ -46,6 +47,12 @@ LEVELS = 24
 
 LEAST_STEPS = 50
 """Least steps of a level."""
+
+LEARNED_STEPS = 100_000
+"""Most steps from which the noise is learned: each of `LEVELS` medians is then known to two per cent."""
+
+QUANTISED_VALUES = 16_384
+"""Most values of a sweep in which its quantisation is sought."""
 
 MEDIAN_TO_SIGMA = 1.4826
 """Standard deviation of a normal variable with the median magnitude 1."""
@@ -103,7 +110,8 @@ def reflectance_steps(lines: ScanLines, reflectance: NDArray[np.float32]) -> Ref
         lines.same_line_rad,
         lines.one_line_per_row,
     )
-    distinct = np.unique(values[np.isfinite(values)])
+    distinct = np.unique(values[thinned(len(values), QUANTISED_VALUES)])
+    distinct = distinct[np.isfinite(distinct)]
     quantum = float(np.diff(distinct).min()) if 1 < len(distinct) <= MOST_VALUES else 0.0
     return ReflectanceSteps(lines, height, level, turn_rad, highest, quantum)
 
@@ -112,7 +120,9 @@ def learn_noise(sweeps: Sequence[ReflectanceSteps]) -> ReflectanceNoise | None:
     """The noise of a LiDAR, from its sweeps; None if there are too few steps, or all of one value."""
     if not sweeps:
         return None
-    finite = [np.isfinite(steps.height) for steps in sweeps]
+    most = LEARNED_STEPS // len(sweeps)
+    finite = [np.flatnonzero(np.isfinite(steps.height)) for steps in sweeps]
+    finite = [of[thinned(len(of), most)] for of in finite]
     height = np.concatenate([np.abs(steps.height[of]) for steps, of in zip(sweeps, finite, strict=True)])
     level = np.concatenate([steps.level[of] for steps, of in zip(sweeps, finite, strict=True)])
     if len(height) < LEAST_STEPS or not height.any():
