@@ -58,6 +58,7 @@ from coec.io.ros.message_decoding import ENCODINGS
 from coec.io.ros.transforms import MovingFrame, StaticTransforms, decode_static_transforms, frames_in
 from coec.io.ros.translations import TRANSLATIONS, translation_of
 from coec.io.serialise import estimate_of, result_of
+from coec.io.video import VideoReader, VideoTrack
 from coec.io.zenoh.session import mode_of, settings_of
 from coec.schemas import keys
 from coec.schemas.commands import COMMAND_NAMES
@@ -118,6 +119,7 @@ from support.ros import (
     twist_with_covariance,
 )
 from support.vehicles import InstantDiskWriter
+from support.video import encoded, parameters, pictures, slice_of
 
 LOG = logging.getLogger(__name__)
 LIMITS = LimitsConfig()
@@ -394,6 +396,34 @@ def _ros1_seeds() -> list[bytes]:
                     writer.write(connection, time, store.cdr_to_ros1(cdr, name))
             seeds.append((Path(folder) / "drive.bag").read_bytes())
     return seeds
+
+
+def _video(data: bytes, folder: Path) -> None:
+    """The first byte chooses the codec; packets stand behind their lengths."""
+    del folder
+    packets, at = [], 1
+    while at + 2 <= len(data):
+        (length,) = struct.unpack_from("<H", data, at)
+        packets.append(data[at + 2 : at + 2 + length])
+        at += 2 + length
+    track = VideoTrack("hevc" if data[:1] == b"\1" else "h264")
+    decodable = [number for number, packet in enumerate(packets) if track.add(packet, (number,))]
+    reader = VideoReader(track, lambda place: packets[place[0]], LIMITS)
+    for number in decodable:
+        image = reader.picture((number,))
+        assert image is None or len(image.data) == 3 * image.width * image.height
+
+
+def _video_seeds() -> list[bytes]:
+    by_hand = [parameters(order=1), slice_of(0, key=True), slice_of(1), slice_of(3)]
+    streams = [
+        (b"\0", by_hand),
+        (b"\0", [packet.data for packet in encoded("libx264", pictures(5, 32, 16), gop=3, between=1)]),
+        (b"\1", [packet.data for packet in encoded("libx265", pictures(3, 32, 32), gop=2)]),
+    ]
+    return [
+        codec + b"".join(struct.pack("<H", len(packet)) + packet for packet in packets) for codec, packets in streams
+    ]
 
 
 SCHEMAS = (
@@ -921,6 +951,7 @@ TARGETS: Final = {
         Target("bag", _bag, _bag_seeds, (in_records,), (b"lz4", b"zstd", b"equidistant")),
         Target("ros1", _ros1, _ros1_seeds, labels=(b"op=", b"conn=", b"compression=", b"bz2", b"lz4")),
         Target("translated", _translated, _translated_seeds, labels=(b"timestamp", b"frame_id")),
+        Target("video", _video, _video_seeds, labels=(b"\0\0\1\x67", b"\0\0\1\x65", b"\0\0\1\x40\1")),
         Target("nominal", _nominal, _nominal_seeds, (behind(1, checksummed),), (b"equidistant", b"camera", *JSON_TEXT)),
         Target("window", _window, _window_seeds, (in_records,), (b"lz4", b"zstd")),
         Target("selector", _selector, _selector_seeds, labels=(b";", b"=", b"/", b"@v1", b"*", b"?", b"_")),

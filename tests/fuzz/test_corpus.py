@@ -99,6 +99,11 @@ def test_translated(held: Replay) -> None:
     held("translated")
 
 
+@pytest.mark.fault("a stream of video, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
+def test_video(held: Replay) -> None:
+    held("video")
+
+
 def test_ply(held: Replay) -> None:
     held("ply")
 

@@ -5,6 +5,7 @@ A bag is read through once for its index (`index`); each message is read again w
 
 from __future__ import annotations
 
+import logging
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -20,8 +21,15 @@ from coec.io.recordings.bag_recognition import PairMessages, Sweep, lidar_frame_
 from coec.io.recordings.bag_storage import BagReader, BagStorage, open_storage
 from coec.io.recordings.cloud_files import measured_from
 from coec.io.recordings.recording_source import evenly_spread
-from coec.io.ros import messages
+from coec.io.ros import message_decoding, messages
 from coec.io.ros.topics import TopicInfo, TopicMessage
+from coec.io.ros.transforms import bare
+from coec.io.video import MAX_PIXELS, VideoReader, VideoTrack
+
+LOG = logging.getLogger(__name__)
+
+FIRST_IMAGES = 64
+"""Pictures of a video among which one has to be decodable."""
 
 _EGO, _LIDAR, _CAMERA = 0, 1, 2
 """Order of messages with equal stamps, as in `sources.recording`."""
@@ -83,7 +91,7 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
     readings = bag_recognition.Readings.from_query(query)
     storage = open_storage(spec.path)
     index = bag_index.build_index(storage, clouds)
-    camera_topic = index.topic(bag_index.IMAGE_TYPES, query.get("camera"), "camera")
+    camera_topic = index.camera_topic(query.get("camera"))
     lidar_topic = index.topic(bag_index.CLOUD_TYPES, query.get("points"), "points")
     index.require_one_frame(camera_topic, query.get("camera_frame"), "camera_frame")
     index.require_one_frame(lidar_topic, query.get("lidar_frame"), "lidar_frame")
@@ -91,7 +99,7 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
         streams, of_twists = _streams(
             index, reader, camera_topic, lidar_topic, (frames, query.get("odometry")), readings
         )
-        camera = _load(storage, reader, streams.camera[0], clouds)
+        camera = _first_image(spec.path, _Images(storage, reader, streams.video), streams.camera)
         cloud = _load(storage, reader, streams.lidar[0], clouds)
         motions = [*streams.moved[:1], *(_load(storage, reader, place, clouds) for place in streams.motion[:1])]
         motion = motions[0] if motions else None
@@ -102,7 +110,7 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
     rig, T_cloud_lidar, of_rig = _rig(index, pair, query)
     if motion is not None and any(one.code == UNCONNECTED for one in of_rig):
         streams = replace(streams, motion=[], moved=())
-    recognitions = (*of_transforms, *of_rig, *(() if of_twists is None else (of_twists,)))
+    recognitions = (*_of_video(streams.video), *of_transforms, *of_rig, *(() if of_twists is None else (of_twists,)))
     name, start = f"{spec.path.name}{camera_topic}", rig.T_camera_lidar_nominal
     recording = BagRecording(name, rig, start, storage, streams, T_cloud_lidar, clouds, readings, recognitions)
     return recording.recognised()
@@ -168,12 +176,14 @@ class PairStreams:
 
     Attributes:
         moved: the motion itself, instead of `motion`, if it was taken from transforms; ascending by stamp.
+        video: the packets of the camera, if its topic is one of video.
     """
 
     camera: list[bag_index.MessageLocation]
     lidar: list[Sweep]
     motion: list[bag_index.MessageLocation]
     moved: tuple[EgoMotion, ...] = ()
+    video: VideoTrack | None = None
 
     @property
     def motions(self) -> list[bag_index.MessageLocation | EgoMotion]:
@@ -242,14 +252,18 @@ class BagRecording:
             for number, item in enumerate(items)
         ]
         with self.storage.open() as reader:
-            for *_, item in sorted(queue, key=lambda entry: entry[:3]):
+            images = _Images(self.storage, reader, self.streams.video)
+            for _, kind, _, item in sorted(queue, key=lambda entry: entry[:3]):
                 if isinstance(item, EgoMotion):
                     yield item
                 elif isinstance(item, Sweep):
                     yield self._sweep(reader, item)
-                else:
-                    message = _load(self.storage, reader, item, self.clouds)
-                    yield replace(message, stamp_ns=item.stamp_ns) if isinstance(message, CameraFrame) else message
+                elif kind != _CAMERA:
+                    yield _load(self.storage, reader, item, self.clouds)
+                elif (image := images.load(item)) is not None:
+                    yield image
+        if images.not_decoded:
+            LOG.warning("%s: %d pictures of the video could not be decoded", self.name, images.not_decoded)
 
     def recognised(self) -> BagRecording:
         """The recording with its sweeps as their points show them: clouds that are parts of a turn are joined, and
@@ -353,7 +367,10 @@ def _streams(
     sweeps = [
         Sweep(place.stamp_ns, place.at, place.type_name, clouds=(place,)) for place in index.streams[lidar].ordered()
     ]
-    return PairStreams(index.streams[camera].ordered(), sweeps, places, moved), of_twists
+    images = index.streams[camera]
+    # One frame is left, see `require_one_frame`.
+    video = images.videos.get(bare(images.locations[0].frame_id))
+    return PairStreams(images.ordered(), sweeps, places, moved, video), of_twists
 
 
 def _require_stamps(index: bag_index.BagIndex, topic: str) -> None:
@@ -377,6 +394,62 @@ def _frames(text: str | None) -> tuple[str, str]:
             f"moving={text}: give the frame in which the vehicle moves, and its own: moving=odom,base_link"
         )
     return parent, child
+
+
+class _Images:
+    """Loads the images of a topic, each a message, or a packet of video."""
+
+    def __init__(self, storage: BagStorage, reader: BagReader, video: VideoTrack | None) -> None:
+        self._storage, self._reader, self.not_decoded = storage, reader, 0
+        self._video = None if video is None else VideoReader(video, self._packet, bag_index.LIMITS)
+        self._type_name = ""
+
+    def load(self, place: bag_index.MessageLocation) -> Frame | None:
+        """The image of a message, with the stamp of its place; None if it is of a video and cannot be decoded.
+
+        Raises:
+            SourceError: the message holds no image.
+        """
+        if self._video is None:
+            frame = _load(self._storage, self._reader, place, bag_index.CloudDecoder())
+            return replace(frame, stamp_ns=place.stamp_ns) if isinstance(frame, CameraFrame) else frame
+        self._type_name = place.type_name
+        try:
+            image = self._video.picture(place.at)
+        except DecodeError as error:
+            raise SourceError(f"{self._storage.path}: the video at {place.stamp_ns} ns: {error}") from error
+        if image is None:
+            self.not_decoded += 1
+            return None
+        return CameraFrame(place.stamp_ns, place.frame_id, image)
+
+    def _packet(self, at: tuple[int, ...]) -> bytes:
+        video = message_decoding.video_data(self._type_name, self._reader.read(at))
+        return b"" if video is None else video[1]
+
+
+def _first_image(path: Path, images: _Images, places: Sequence[bag_index.MessageLocation]) -> Frame:
+    """The first image that can be decoded."""
+    for place in places[:FIRST_IMAGES]:
+        image = images.load(place)
+        if image is not None:
+            return image
+    raise SourceError(
+        f"{path}: none of the first pictures of the video can be decoded: it is damaged, or larger than {MAX_PIXELS} "
+        "pixels"
+    )
+
+
+def _of_video(video: VideoTrack | None) -> tuple[Recognition, ...]:
+    """What to tell of pictures that were left out."""
+    if video is None or not video.left_out:
+        return ()
+    text = (
+        f"Of the video, {bag_index.video_left_out(video)} cannot be decoded and are left out, beside "
+        f"{len(video.packets)} that can: let the encoder send a key frame each second (FFmpeg: gop_size), and record "
+        "without loss (larger caches, reliable QoS)."
+    )
+    return (Recognition("video_left_out", text, "warn"),)
 
 
 def _load(

@@ -25,6 +25,7 @@ from coec.errors import DecodeError, SourceError, UsageError
 from coec.io.recordings.bag_storage import MAX_MESSAGE_BYTES, BagMessage, BagReader, BagStorage
 from coec.io.ros import camera_info, message_decoding, messages, point_clouds
 from coec.io.ros import transforms as ros_transforms
+from coec.io.video import VideoTrack, codec_of
 from coec.schemas.keys import TF_STATIC
 
 LIMITS: Final = LimitsConfig(max_message_bytes=MAX_MESSAGE_BYTES)
@@ -70,7 +71,8 @@ class CloudDecoder:
         return message_decoding.decode(type_name, data, LIMITS, point_time=self.point_time, source=self.source)
 
 
-IMAGE_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE)
+VIDEO_TYPES = (messages.FFMPEG_PACKET, messages.COMPRESSED_VIDEO)
+IMAGE_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE, *VIDEO_TYPES)
 CLOUD_TYPES = (messages.POINT_CLOUD, *point_clouds.TYPES)
 VELOCITY_TYPES = (messages.ODOMETRY, messages.TWIST, messages.TWIST_WITH_COVARIANCE)
 ROTATION_TYPES = (messages.IMU,)
@@ -79,6 +81,9 @@ T = TypeVar("T")
 
 MAX_TF_MESSAGES: Final = 10_000
 """Most messages of transforms of a topic that are looked at for constant ones."""
+
+MAX_FORMAT: Final = 40
+"""Most characters of the format of a video in a message."""
 
 UNMOVED: Final = 1e-6
 """Entries of a pose that change by less are constant."""
@@ -100,10 +105,15 @@ class MessageLocation:
 
 @dataclass(slots=True)
 class TopicStream:
-    """The frames of a topic."""
+    """The frames of a topic.
+
+    Attributes:
+        videos: of a topic of video, the packets by the frame that they name; `locations` has those of pictures.
+    """
 
     type_name: str
     locations: list[MessageLocation] = field(default_factory=list)
+    videos: dict[str, VideoTrack] = field(default_factory=dict)
 
     def ordered(self) -> list[MessageLocation]:
         """The places in the order of their stamps."""
@@ -124,7 +134,7 @@ class BagIndex:
         streams: frames by topic.
         infos: the camera infos of each topic.
         transforms: all static transforms.
-        unread: topics of types that hold frames in another form, for which `REFUSED` has advice.
+        unread: topics of frames in another form, with what they have and what to do.
         transforms_at: places of the messages of all other transforms, by topic, in the order in the bag.
     """
 
@@ -144,17 +154,16 @@ class BagIndex:
         """
         topic = self.optional_topic(types, requested, key)
         if topic is None:
-            advice = "".join(
-                f"; {other} has {type_name}: {message_decoding.REFUSED[type_name]}"
-                for other, type_name in self.unread.items()
-            )
-            named = " or ".join(name for name in types if name not in point_clouds.TYPES)
+            advice = "".join(f"; {other} has {text}" for other, text in self.unread.items())
+            named = " or ".join(name for name in types if name not in (*point_clouds.TYPES, *VIDEO_TYPES))
             raise SourceError(f"{self.path} has no message of type {named}{advice}")
         return topic
 
     def optional_topic(self, types: tuple[str, ...], requested: str | None, key: str) -> str | None:
         """As `topic`, but None if the bag has none and none was asked for."""
-        there = [topic for topic, stream in self.streams.items() if stream.type_name in types]
+        there = [
+            topic for topic, one in self.streams.items() if one.type_name in types and (one.locations or one.videos)
+        ]
         if requested is not None:
             if requested not in there:
                 raise SourceError(
@@ -168,6 +177,24 @@ class BagIndex:
             )
             raise SourceError(f"{self.path} has several topics for {key}, choose one with ?{key}=...: {candidates}")
         return there[0] if there else None
+
+    def camera_topic(self, requested: str | None) -> str:
+        """The topic of images that was asked for, else the only one of pictures, else the only one of video.
+
+        Raises:
+            SourceError: as `topic`; or a video has no key frame.
+        """
+        of_images = [(t, one) for t, one in self.streams.items() if one.type_name in IMAGE_TYPES]
+        pictures = [topic for topic, one in of_images if one.locations and not one.videos]
+        topic = self.topic(IMAGE_TYPES, pictures[0] if not requested and len(pictures) == 1 else requested, "camera")
+        stream = self.streams[topic]
+        if not stream.locations:
+            left_out = "; ".join(video_left_out(track) for track in stream.videos.values())
+            raise SourceError(
+                f"{self.path}: no picture of the video on {topic} can be decoded: {left_out}. Key frames are those "
+                "of type IDR (H.264) or IRAP (H.265), with their parameter sets: let the encoder send one each second"
+            )
+        return topic
 
     def transform(self, target: str, source: str) -> Matrix4 | None:
         """T_target_source (4, 4) along the static transforms; None if they do not connect the two frames.
@@ -248,6 +275,8 @@ class BagIndex:
             if stamp_ns == 0 and name in CLOUD_TYPES:
                 stamp_ns = self._stamp_of_points(entry)
             frame_id = sys.intern(messages.header_frame_id(entry.data))
+            if name in (messages.COMPRESSED_IMAGE, *VIDEO_TYPES) and not self._is_picture(entry, stream, frame_id):
+                return
             stream.locations.append(MessageLocation(stamp_ns, entry.place, name, frame_id))
         elif name == messages.CAMERA_INFO:
             self._decoded(entry, self.infos.setdefault(entry.topic, camera_info.CameraInfos()).add)
@@ -256,10 +285,30 @@ class BagIndex:
             self.transforms.refuse(decoded.refused)
             self._decoded(entry, lambda _: self.transforms.add(decoded.joints))
         elif name in message_decoding.REFUSED and name != messages.TF:
-            if len(self.unread) < LISTED:
-                self.unread[entry.topic] = name
+            self._leave_unread(entry.topic, f"{name}: {message_decoding.REFUSED[name]}")
         elif name == messages.TF:
             self.transforms_at.setdefault(entry.topic, []).append(entry.place)
+
+    def _leave_unread(self, topic: str, text: str) -> None:
+        if len(self.unread) < LISTED:
+            self.unread[topic] = text
+
+    def _is_picture(self, entry: BagMessage, stream: TopicStream, frame_id: str) -> bool:
+        """Notes a packet of video. Returns False if its picture cannot be decoded, or if it has none."""
+        try:
+            video = message_decoding.video_data(entry.type_name, entry.data)
+        except DecodeError as error:
+            if entry.type_name in VIDEO_TYPES:
+                self._leave_unread(entry.topic, f"a damaged {entry.type_name}: {error}")
+            return entry.type_name not in VIDEO_TYPES  # a picture is refused when it is used
+        if video is None:
+            return True
+        codec = codec_of(video[0])
+        if codec is None:
+            self._leave_unread(entry.topic, f"video of the format {video[0][:MAX_FORMAT]!a}: H.264 and H.265 are read")
+            return False
+        track = stream.videos.setdefault(ros_transforms.bare(frame_id), VideoTrack(codec))
+        return track.add(video[1], entry.place)
 
     def _stamp_of_points(self, entry: BagMessage) -> int:
         """Stamp of a cloud without one, from its points; 0 if they give none. If the cloud cannot be decoded, that is
@@ -274,6 +323,11 @@ class BagIndex:
             return decode(entry.data)
         except DecodeError as error:
             raise SourceError(f"{self.path}: a {entry.type_name} on {entry.topic} is refused: {error}") from error
+
+
+def video_left_out(track: VideoTrack) -> str:
+    """How many pictures of a video were left out, by cause."""
+    return ", ".join(f"{count} {cause}" for cause, count in track.left_out.items()) or "there is none"
 
 
 def build_index(storage: BagStorage, clouds: CloudDecoder) -> BagIndex:

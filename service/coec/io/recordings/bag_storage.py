@@ -171,7 +171,7 @@ class _McapReader:
         return translated(number[0], data, f"{self.path}: a message") if number else data
 
 
-_READ = frozenset((*message_decoding.KNOWN, messages.CAMERA_INFO, messages.TF))
+_READ = frozenset((*message_decoding.KNOWN, *messages.OTHER_TYPES, messages.CAMERA_INFO, messages.TF))
 """Types of ROS 2 from which something is read; messages of others are somebody else's."""
 
 

@@ -212,10 +212,7 @@ def compressed_image(message: CompressedImage, limits: LimitsConfig) -> EncodedI
             "a depth image (compressedDepth) is no camera's picture: take the topic that ends with /compressed",
         )
     if any(codec in text for codec in _VIDEO_FORMATS) or data.startswith(_START_CODES):
-        raise DecodeError(
-            Refusal.IMAGE_UNKNOWN_FORMAT,
-            "packets of video (h264 and the like) are not read: take the camera's topic of JPEG or of raw pixels",
-        )
+        raise DecodeError(Refusal.IMAGE_UNKNOWN_FORMAT, _VIDEO)
     converted = from_file(data, limits)
     return probe(data, limits) if converted is None else converted
 
@@ -321,8 +318,8 @@ def check_motion(payload: bytes) -> None:
 
 
 _VIDEO: Final = (
-    "packets of video are no pictures: take the camera's topic of JPEG (image_transport) or of raw pixels, or unpack "
-    "them with `ros2 run image_transport republish`"
+    "packets of video are no pictures (H.264 and H.265 are read from recordings): take the camera's topic of JPEG "
+    "(image_transport) or of raw pixels, or unpack them with `ros2 run image_transport republish`"
 )
 _PACKED: Final = (
     "clouds packed by point_cloud_transport (Draco, Cloudini, zlib) are not read: unpack them with `ros2 run "
@@ -331,8 +328,8 @@ _PACKED: Final = (
 _PACKETS: Final = "packets of the LiDAR are no points: take the topic on which its driver sends PointCloud2"
 
 REFUSED: Final = {
-    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": _VIDEO,
-    "foxglove_msgs/msg/CompressedVideo": _VIDEO,
+    messages.FFMPEG_PACKET: _VIDEO,
+    messages.COMPRESSED_VIDEO: _VIDEO,
     "foxglove_msgs/msg/CompressedPointCloud": _PACKED,
     "theora_image_transport/msg/Packet": _VIDEO,
     "velodyne_msgs/msg/VelodyneScan": _PACKETS,
@@ -392,6 +389,20 @@ _MOTIONS: Final[dict[str, Callable[[bytes], EgoMotion]]] = {
 
 KNOWN: Final = (messages.COMPRESSED_IMAGE, messages.IMAGE, messages.POINT_CLOUD, *_MOTIONS, *point_clouds.TYPES)
 """Types of messages that hold a frame."""
+
+
+def video_data(type_name: str, payload: bytes) -> tuple[str, bytes] | None:
+    """The format of a packet of video, as its sender names it, and its data; None for a picture of another format.
+
+    Raises:
+        DecodeError: the payload is not this message.
+    """
+    check_header(payload)
+    message = messages.deserialized_by_name(type_name, payload)
+    form = str(message.encoding if type_name == messages.FFMPEG_PACKET else message.format)
+    if type_name == messages.COMPRESSED_IMAGE and not any(codec in form.lower() for codec in _VIDEO_FORMATS):
+        return None
+    return form, message.data.tobytes()
 
 
 def _compressed_image(payload: bytes, limits: LimitsConfig) -> CameraFrame:

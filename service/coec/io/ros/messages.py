@@ -7,7 +7,7 @@ import struct
 from typing import Any, Final, TypeVar
 
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.stores import ros2_humble as ros
 
 from coec.errors import DecodeError
@@ -24,7 +24,22 @@ CAMERA_INFO: Final = "sensor_msgs/msg/CameraInfo"
 TF: Final = "tf2_msgs/msg/TFMessage"
 DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
 
+FFMPEG_PACKET: Final = "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
+COMPRESSED_VIDEO: Final = "foxglove_msgs/msg/CompressedVideo"
+
+_DEFINITIONS: Final = {
+    FFMPEG_PACKET: "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\nuint64 pts\nuint8 flags\n"
+    "bool is_bigendian\nuint8[] data\n",
+    COMPRESSED_VIDEO: "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n",
+}
+"""Of types that are not ROS's own."""
+
+OTHER_TYPES: Final = tuple(_DEFINITIONS)
+"""Types that are not ROS's own, and that are read."""
+
 _STORE = get_typestore(Stores.ROS2_HUMBLE)
+for _name, _definition in _DEFINITIONS.items():
+    _STORE.register(get_types_from_msg(_definition, _name))
 
 T = TypeVar("T")
 
@@ -41,13 +56,18 @@ def deserialized(message_type: type[T], payload: bytes) -> T:
     Raises:
         DecodeError: the payload is not this message, or is cut off.
     """
-    try:
-        message = _STORE.deserialize_cdr(memoryview(payload), message_type.__msgtype__)  # type: ignore[attr-defined]
-    except (SerdeError, ValueError, IndexError, struct.error) as error:
-        raise DecodeError(Refusal.MESSAGE_MALFORMED, "not this message in CDR, or cut off") from error
+    message = deserialized_by_name(message_type.__msgtype__, payload)  # type: ignore[attr-defined]
     if not isinstance(message, message_type):
         raise TypeError(f"the type store made {type(message)} of {message_type}")
     return message
+
+
+def deserialized_by_name(type_name: str, payload: bytes) -> Any:
+    """The same, of a type by its name, which may be one of `OTHER_TYPES`."""
+    try:
+        return _STORE.deserialize_cdr(memoryview(payload), type_name)
+    except (SerdeError, ValueError, IndexError, struct.error) as error:
+        raise DecodeError(Refusal.MESSAGE_MALFORMED, "not this message in CDR, or cut off") from error
 
 
 def serialized(message: Any, type_name: str) -> bytes:
@@ -65,13 +85,13 @@ def cdr_of_ros_1(data: bytes, type_name: str) -> bytes:
 
 
 def known_types() -> tuple[str, ...]:
-    """The names of ROS's own types, sorted."""
+    """The names of ROS's own types, and of `OTHER_TYPES`, sorted."""
     return tuple(sorted(_STORE.fielddefs))
 
 
 def is_known(type_name: str) -> bool:
     """Whether it is one of ROS's own types; only their hashes are known."""
-    return type_name in _STORE.fielddefs
+    return type_name in _STORE.fielddefs and type_name not in _DEFINITIONS
 
 
 def has_header(type_name: str) -> bool:

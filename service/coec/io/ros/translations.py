@@ -1,5 +1,5 @@
 """Messages in other encodings as ROS 2 messages in CDR: those of ROS 1, and Foxglove's schemas in protobuf and JSON
-(images, clouds, calibrations, transforms). Recordings of these read like ROS 2 bags.
+(images, video, clouds, calibrations, transforms). Recordings of these read like ROS 2 bags.
 
 Protobuf is read by a few lines that know the wire format (protobuf.dev, "Encoding"), so that no library builds anything
 from the lengths in a message; each length is checked against what is left. Foxglove's numbers of fields are those of
@@ -171,6 +171,12 @@ _COMPRESSED_IMAGE: Final = {
     3: ("format", "text"),
     4: ("frame_id", "text"),
 }
+_COMPRESSED_VIDEO: Final = {
+    1: ("timestamp", _TIMESTAMP),
+    2: ("frame_id", "text"),
+    3: ("data", "bytes"),
+    4: ("format", "text"),
+}
 _RAW_IMAGE: Final = {
     1: ("timestamp", _TIMESTAMP),
     2: ("width", "number"),
@@ -280,6 +286,7 @@ def _doubles(values: Mapping[str, Any], name: str, count: int | None) -> Any:
 
 _FOXGLOVE: Final[Mapping[str, tuple[str, Fields, Callable[[Mapping[str, Any]], Any]]]] = {
     "foxglove.CompressedImage": (messages.COMPRESSED_IMAGE, _COMPRESSED_IMAGE, _compressed_image),
+    "foxglove.CompressedVideo": (messages.COMPRESSED_IMAGE, _COMPRESSED_VIDEO, _compressed_image),
     "foxglove.RawImage": (messages.IMAGE, _RAW_IMAGE, _raw_image),
     "foxglove.PointCloud": (messages.POINT_CLOUD, _POINT_CLOUD, _point_cloud),
     "foxglove.CameraCalibration": (messages.CAMERA_INFO, _CALIBRATION, _calibration),
