@@ -168,3 +168,17 @@ def _slow(
     for k in np.flatnonzero(plateau).tolist():
         highest[k] = (size[k - 2 : k] < size[k]).all() and (size[k + 1 : k + 3] <= size[k]).all()
     return height, highest
+
+
+def test_leaves_have_no_edges_but_the_border_of_their_bush_has() -> None:
+    xyz_m, ring, azimuth_deg = wall()
+    rng = np.random.default_rng(5)
+    leaf = np.floor(azimuth_deg / (4 * SPACING_DEG)).astype(np.int64) + 100 * ring.astype(np.int64)
+    leaves = rng.uniform(70.0, 120.0, leaf.max() - leaf.min() + 1)[leaf - leaf.min()]
+    # Most of the scene is smooth and of the same levels, so that the noise of the sensor does not hide the leaves.
+    bush = azimuth_deg < -20.0
+    edges = edges_of(xyz_m, ring, calibrated(np.where(bush, leaves, 90.0 + azimuth_deg), rng))
+    at_deg = azimuth_deg[edges.index]
+    # In each scan line eleven leaves end within the bush; five of them would be edges by the sensor's noise alone.
+    assert np.count_nonzero(at_deg < -21.0) < 2.5 * RINGS
+    assert np.count_nonzero(np.abs(at_deg + 20.0) < 2.0 * SPACING_DEG) > 0.5 * RINGS

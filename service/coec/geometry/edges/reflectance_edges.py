@@ -3,8 +3,9 @@ signs, plates, boards and joints of walls make such edges, and an image edge wit
 
 Five neighbours along a scan line form a step if they lie on one smooth surface: two before, the point, two after. Its
 height is the difference of the means of both sides. It counts as an edge if it is steep against the noise of this LiDAR
-at this level, if both sides are plateaus, and if no step next to it is higher. Its position between the neighbours
-follows from the value of the point in the middle, which the beam gathers from both sides.
+at this level and against the steps beside it, if both sides are plateaus, and if no step next to it is higher. Its
+position between the neighbours follows from the value of the point in the middle, which the beam gathers from both
+sides.
 
 Every LiDAR has its own scale, quantisation and noise: calibrated values of 8 bits, or raw ones whose scatter grows with
 their level. So the noise is learned from the sweeps: the median height of all steps at a level, most of which lie on
@@ -34,6 +35,11 @@ SMOOTH_M, SMOOTH_SHARE = 0.05, 0.02
 
 LEAST_STEP = 5.0
 """Least height of an edge, in standard deviations of steps without an edge."""
+
+SURROUNDING = 24
+"""Neighbours on a side whose steps show how rough the surface is there: an edge has to stand out from the smoother of
+its sides by `LEAST_STEP` standard deviations, too. Within leaves and grass, which are rough on both, most steps lie
+where an image shows none. See docs/measured.md."""
 
 PLATEAU_SHARE = 0.5
 """Largest difference between the two points of a side, as a share of the height."""
@@ -73,6 +79,8 @@ class ReflectanceSteps:
         height: (M,) float32; NaN where five neighbours lie on no smooth surface.
         level: (M,) float32, the mean of both sides.
         turn_rad: (M,) float32, from the point to the edge, azimuth.
+        roughness: (M,) float32, the median magnitude of the steps beside the highest ones, on their smoother side; 0
+            elsewhere.
         highest: (M,) bool, whether both sides are plateaus and no step next to this one is higher.
         quantum: the distance between neighbouring values of the sweep; 0 if it is not quantised.
     """
@@ -81,6 +89,7 @@ class ReflectanceSteps:
     height: NDArray[np.float32]
     level: NDArray[np.float32]
     turn_rad: NDArray[np.float32]
+    roughness: NDArray[np.float32]
     highest: NDArray[np.bool_]
     quantum: float
 
@@ -101,7 +110,7 @@ def reflectance_steps(lines: ScanLines, reflectance: NDArray[np.float32]) -> Ref
     """The steps of reflectance along the scan lines of a sweep; `reflectance` (N,) is in any unit, and anything that is
     not finite is unknown."""
     values = np.where(np.isfinite(reflectance), reflectance, np.nan).astype(np.float32)
-    height, level, turn_rad, highest = _steps(
+    height, level, turn_rad, roughness, highest = _steps(
         lines.first,
         lines.azimuth,
         lines.elevation,
@@ -113,7 +122,7 @@ def reflectance_steps(lines: ScanLines, reflectance: NDArray[np.float32]) -> Ref
     distinct = np.unique(values[thinned(len(values), QUANTISED_VALUES)])
     distinct = distinct[np.isfinite(distinct)]
     quantum = float(np.diff(distinct).min()) if 1 < len(distinct) <= MOST_VALUES else 0.0
-    return ReflectanceSteps(lines, height, level, turn_rad, highest, quantum)
+    return ReflectanceSteps(lines, height, level, turn_rad, roughness, highest, quantum)
 
 
 def learn_noise(sweeps: Sequence[ReflectanceSteps]) -> ReflectanceNoise | None:
@@ -143,7 +152,10 @@ def reflectance_edges(steps: ReflectanceSteps, noise: ReflectanceNoise) -> Sweep
     at = np.flatnonzero(steps.highest)
     height, level = steps.height[at].astype(np.float64), steps.level[at].astype(np.float64)
     sides = [noise.at(level + share * height) for share in (-0.5, 0.5)]
-    at = at[np.abs(height) > LEAST_STEP * np.sqrt(0.5 * (sides[0] ** 2 + sides[1] ** 2))]
+    sigma = np.maximum(
+        np.sqrt(0.5 * (sides[0] ** 2 + sides[1] ** 2)), MEDIAN_TO_SIGMA * steps.roughness[at].astype(np.float64)
+    )
+    at = at[np.abs(height) > LEAST_STEP * sigma]
     index = steps.lines.order[at].astype(np.int64)
     shift_m = turned_about_the_axis(steps.lines.xyz_m[index], steps.turn_rad[at])
     return SweepEdges(index, shift_m, np.ones(len(index), np.float32))
@@ -158,10 +170,11 @@ def _steps(
     value: NDArray[np.float32],
     same_line: float,
     one_line_per_row: bool,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
     count = azimuth.shape[0]
     height, level = np.full(count, np.nan, np.float32), np.zeros(count, np.float32)
     turn_rad, highest = np.zeros(count, np.float32), np.zeros(count, np.bool_)
+    roughness = np.zeros(count, np.float32)
     following, previous = np.full(count, -1, np.int32), np.full(count, -1, np.int32)
     for r in prange(first.shape[0] - 1):
         begin, end = first[r], first[r + 1]
@@ -206,4 +219,20 @@ def _steps(
                     or abs(height[c]) > most
                     or abs(height[following[c]]) > most
                 )
-    return height, level, turn_rad, highest
+                if highest[k]:
+                    roughness[k] = min(_median_along(height, previous, k), _median_along(height, following, k))
+    return height, level, turn_rad, roughness, highest
+
+
+@njit(cache=True)
+def _median_along(height: NDArray[np.float32], towards: NDArray[np.int32], k: int) -> float:
+    """The median magnitude of the steps of the next `SURROUNDING` neighbours of point k; 0 if none is known."""
+    along, number = np.empty(SURROUNDING, np.float32), 0
+    for _ in range(SURROUNDING):
+        k = towards[k]
+        if k < 0:
+            break
+        if not math.isnan(height[k]):
+            along[number] = abs(height[k])
+            number += 1
+    return float(np.median(along[:number])) if number else 0.0
