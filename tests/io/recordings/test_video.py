@@ -315,6 +315,6 @@ def test_a_drive_as_video_decides_within_one_sigma_of_the_same_drive_as_pictures
     native, of_video = results
     assert native.accepted
     assert of_video.accepted
-    apart = np.abs(of_video.correction[:3] - native.correction[:3]) / native.sigma[:3]
-    record_property("figure", f"{encoder}: {apart.max():.2f} standard deviations apart")
-    assert apart.max() < 1.0
+    distance = np.abs(of_video.correction[:3] - native.correction[:3]) / native.sigma[:3]
+    record_property("figure", f"{encoder}: {distance.max():.2f} standard deviations distance")
+    assert distance.max() < 1.0
