@@ -34,6 +34,7 @@ from coec.io.exported_extrinsic import ExportedExtrinsic, ExportFrames, extrinsi
 from coec.io.exports import formats
 from coec.io.images import GreyImages
 from coec.io.recordings import window_cutting
+from coec.io.recordings.bag import MOTION_LEFT_OUT
 from coec.io.recordings.layouts import RecordingSource as Source
 from coec.io.recordings.recording_source import HasGroundTruth
 from coec.io.recordings.window_cutting import LoadedWindow, NoPairsError
@@ -153,6 +154,8 @@ def solve(loaded: LoadedWindow, options: CalibrationOptions, progress: calibrati
         estimate, weighed = calibrate_without_start(window, depth, images, configuration, progress)
     else:
         estimate, mistake = calibrated(window, depth, images, configuration, progress)
+    if estimate.verdict.decision is not calibration.Decision.ACCEPTED:
+        mistake = mistake or _left_out_motion(loaded)
     offset = None
     if options.get("time_offset"):
         offset = estimate_time_offset(window, images, estimate.optimum.T_camera_lidar, configuration)
@@ -207,6 +210,19 @@ def calibrated(
     return estimate, mistake
 
 
+def _left_out_motion(loaded: LoadedWindow) -> calibration.Mistake | None:
+    """The motion that was left out of a recording, as the probable cause of a refusal: distorted sweeps look like other
+    intrinsics, or a camera that moved."""
+    left_out = next((one for one in loaded.recognitions if one.code == MOTION_LEFT_OUT), None)
+    if left_out is None:
+        return None
+    text = f"sweeps without motion compensation are distorted, so that lens or mount seem other ones. {left_out.text}"
+    rig = loaded.window.rig
+    return calibration.Mistake(
+        MOTION_LEFT_OUT, text, nan, nan, rig.camera, rig.T_camera_lidar_nominal, correctable=False
+    )
+
+
 CERTAIN = 5.0
 """An offset of the clocks is named from so many standard deviations on, and from `LEAST_OFFSET_S`."""
 
@@ -230,12 +246,12 @@ def _measured_offset(
     certain = abs(offset.offset_s) >= max(CERTAIN * offset.sigma_s, LEAST_OFFSET_S)
     if not certain or isnan(offset.sigma_s):
         return None
+    cause = stamped_text(window.pairs[0].lidar, offset.offset_s, offset.sigma_s)
     late = "later" if offset.offset_s < 0.0 else "earlier"
     text = (
         f"the stamps of the camera are {1e3 * abs(offset.offset_s):.0f} ± {1e3 * offset.sigma_s:.0f} ms {late} than "
-        "its exposures by the clock of the LiDAR, as of images that are stamped when they are received, or sweeps that "
-        "are stamped at another point: correct the stamps in the driver and record again; of a bag, "
-        f"?camera_offset={offset.offset_s:.4f} is added to the stamps of the camera"
+        f"its exposures by the clock of the LiDAR, {cause}: correct the stamps in the driver and record again; "
+        f"of a bag, ?camera_offset={offset.offset_s:.4f} is added to the stamps of the camera"
     )
     if not offset.observable:
         speeds_mps = [pair.motion.speed_mps or 0.0 for pair in window.pairs if pair.motion is not None]
@@ -245,6 +261,23 @@ def _measured_offset(
         return replace(mistake, text=text)
     rig = window.rig
     return calibration.Mistake(CLOCK_OFFSET, text, nan, nan, rig.camera, rig.T_camera_lidar_nominal, correctable=False)
+
+
+def stamped_text(sweep: calibration.LidarFrame, offset_s: float, sigma_s: float) -> str:
+    """What probably causes an offset of the camera's clock. Half or all of a sweep is that of sweeps that are stamped
+    at another point than that from which the times of their points count."""
+    times_s = sweep.time_offset_s
+    begin_s, end_s = (0.0, 0.0) if times_s is None else (float(times_s.min()), float(times_s.max()))
+    lasts_s = end_s - begin_s
+    counted = ("begin", "end", lasts_s) if abs(begin_s) < 0.1 * lasts_s else ("end", "begin", -lasts_s)
+    for part, place, share in (("half of a", "middle", 0.5), ("a whole", counted[1], 1.0)):
+        away_s = abs(offset_s - share * counted[2])
+        if min(abs(begin_s), abs(end_s)) < 0.1 * lasts_s and away_s < min(3.0 * sigma_s, 0.2 * lasts_s):
+            return (
+                f"which is {part} sweep: the times of points count from its {counted[0]}, and its stamp is probably "
+                f"that of its {place} (?lidar_offset={-share * counted[2]:.4f})"
+            )
+    return "as of images that are stamped when they are received, or sweeps that are stamped at another point"
 
 
 def perturbation_of(perturb: str | Sequence[float]) -> NDArray[np.float64]:

@@ -284,6 +284,16 @@ def _bin_seeds() -> list[bytes]:
     return [POINTS, five.tobytes()]
 
 
+def _las_seeds() -> list[bytes]:
+    """A point each of formats 1 and 6."""
+    seeds = []
+    for minor, form, step, at in ((2, 1, 28, 20), (4, 6, 30, 22)):
+        head = struct.pack("<4s20xBB68xHIIBHI20x6d", b"LASF", 1, minor, 375, 375, 0, form, step, 1, *[0.01] * 6)
+        point = struct.pack("<iiiH", 100, 200, 300, 7).ljust(at, b"\0") + struct.pack("<d", 1e9)
+        seeds.append((head.ljust(247, b"\0") + struct.pack("<Q", 1)).ljust(375, b"\0") + point.ljust(step, b"\0"))
+    return seeds
+
+
 def _npy_seeds() -> list[bytes]:
     arrays = (
         np.ones((4, 3)),
@@ -944,6 +954,7 @@ TARGETS: Final = {
         Target(
             "ply", lambda data, folder: _cloud_file(data, folder, "ply"), _ply_seeds, labels=(b"element", b"property")
         ),
+        Target("las", lambda data, folder: _cloud_file(data, folder, "las"), _las_seeds),
         Target("bin", lambda data, folder: _cloud_file(data, folder, "bin"), _bin_seeds),
         Target("npz", lambda data, folder: _cloud_file(data, folder, "npz"), _npz_seeds, (in_archive,)),
         Target("manifest", _manifest, _manifest_seeds, (in_yaml,), (*YAML_TEXT, b"depth", b"double_sphere", b"mei")),

@@ -108,6 +108,11 @@ def test_ply(held: Replay) -> None:
     held("ply")
 
 
+@pytest.mark.fault("a LAS file, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
+def test_las(held: Replay) -> None:
+    held("las")
+
+
 def test_bin(held: Replay) -> None:
     held("bin")
 

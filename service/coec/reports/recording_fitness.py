@@ -20,8 +20,8 @@ from coec.geometry.cameras import Camera, domain_angle_rad, project_point, unpro
 from coec.geometry.points import lengths
 from coec.geometry.projection import share_in_image
 from coec.io.images import is_order_swapped
+from coec.io.recordings.clocks import clock_separation_text, clocks_text
 from coec.io.recordings.recording_source import RecordingSource, evenly_spread, recognitions_of
-from coec.io.recordings.window_cutting import clock_separation_text, clocks_text
 
 NS_PER_S = 1e9
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from coec.calibration.types import LidarFrame
+from coec.io.recordings.clocks import clock_separation_text, clocks_text, header_clock_text
 from coec.io.recordings.layouts import open_source
-from coec.io.recordings.window_cutting import clock_separation_text, clocks_text
+from coec.recording import stamped_text
 
 BEGIN_NS, FRAMES_NS = 1_700_000_000_000_000_000, [k * 100_000_000 for k in range(20)]
 
@@ -88,3 +92,67 @@ def test_sparse_streams_do_not_show_when_they_begin() -> None:
 def test_real_streams_are_of_one_clock(folder: str, sample_data: Path) -> None:
     recording = open_source(str(sample_data / folder))
     assert clock_separation_text(recording.camera_stamps_ns, recording.sweep_stamps_ns) == ""
+
+
+@pytest.mark.parametrize(
+    ("begin_s", "offset_s", "expected"),
+    [
+        (0.0, 0.05, "half of a sweep: .* count from its begin, .* of its middle .*lidar_offset=-0.0500"),
+        (0.0, 0.1, "a whole sweep: .* count from its begin, .* of its end .*lidar_offset=-0.1000"),
+        (-0.1, -0.05, "half of a sweep: .* count from its end, .* of its middle .*lidar_offset=0.0500"),
+        (-0.1, -0.1, "a whole sweep: .* count from its end, .* of its begin .*lidar_offset=0.1000"),
+        (0.0, -0.05, "stamped when they are received"),
+        (0.0, 0.075, "stamped when they are received"),
+        (-0.05, 0.05, "stamped when they are received"),
+    ],
+)
+def test_an_offset_of_half_a_sweep_is_that_of_its_stamp(begin_s: float, offset_s: float, expected: str) -> None:
+    times_s = np.linspace(begin_s, begin_s + 0.1, 50, dtype=np.float32)
+    sweep = LidarFrame(0, "lidar", np.ones((50, 3), np.float32), time_offset_s=times_s)
+    assert re.search(expected, stamped_text(sweep, offset_s, 0.004))
+    assert "received" in stamped_text(replace(sweep, time_offset_s=None), offset_s, 0.004)
+
+
+# --- the times of receipt ---------------------------------------------------------------------------------------------
+
+LAG_S = [0.02, 0.03, 0.05, 0.02, 0.04]
+
+
+@pytest.mark.parametrize(
+    ("lag_s", "first_s", "expected"),
+    [
+        (
+            -37.0,
+            1.6e9 + 37,
+            "37.0 s ahead of the clock of the recorder, which those on /image follow (this is TAI",
+        ),
+        (18.0, 1.6e9 - 18, "18.0 s behind the clock of the recorder, which those on /image follow (this is GPS time"),
+        (-7200.0, 1.6e9 + 7200, "7200.0 s ahead of the clock of the recorder, .*whole hours, \\+2"),
+        (1.6e9 - 668.0, 668.0, "one stream counts from the start of a computer"),
+        (25.0, 1.6e9 - 25, "25.0 s behind the clock of the recorder, which those on /image follow: let the driver of"),
+    ],
+)
+def test_a_topic_whose_stamps_do_not_follow_the_recorder_is_named(lag_s: float, first_s: float, expected: str) -> None:
+    lags_s = {"/image": LAG_S, "/points": [lag_s + late_s for late_s in LAG_S]}
+    text = header_clock_text(lags_s, {"/image": 1.6e9, "/points": first_s})
+    assert "the stamps on /points are" in text
+    assert re.search(re.escape(expected) if "\\" not in expected else expected, text)
+
+
+@pytest.mark.parametrize(
+    "other_s",
+    [
+        LAG_S,
+        [0.5 + late_s for late_s in LAG_S],  # an image that is compressed, or a slow network
+        [-37.0, -37.0],  # too few
+        [0.0, -10.0, -20.0, -30.0, -40.0],  # a tool wrote one time for all
+    ],
+)
+def test_late_messages_and_times_of_no_recorder_show_no_other_clock(other_s: list[float]) -> None:
+    assert header_clock_text({"/image": LAG_S, "/points": other_s}, {"/image": 1.6e9, "/points": 1.6e9}) == ""
+
+
+def test_one_clock_that_is_not_the_recorders_does_no_harm() -> None:
+    simulated = [1.6e9 + late_s for late_s in LAG_S]
+    assert header_clock_text({"/image": simulated, "/points": simulated}, {"/image": 5.0, "/points": 5.0}) == ""
+    assert header_clock_text({}, {}) == ""

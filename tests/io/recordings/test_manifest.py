@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
+from coec.calibration.frames.motion_compensation import sensor_twist
 from coec.calibration.types import CameraFrame, EgoMotion, ImageFormat, LidarFrame
 from coec.config import LimitsConfig
 from coec.errors import SourceError
 from coec.geometry import cameras, se3
+from coec.geometry.sweep_kernels import deskew
 from coec.io.images import decode_bgr, decode_depth
 from coec.io.recordings.layouts import open_source
+from coec.io.recordings.recording_source import FramewiseRecording
 from support.recordings import pcd
 from support.scenes import ROOF_POSE, sweep_in_frame, turning_sweep
 
@@ -351,3 +354,34 @@ def test_clouds_in_another_frame_come_back_to_the_lidars(tmp_path: Path) -> None
     a_dataset(tmp_path, frames=frames)
     with pytest.raises(SourceError, match=r"given.npz: The points contradict their origin.*`T_cloud_lidar`"):
         list(open_source(str(tmp_path)).messages())
+
+
+def test_compensated_clouds_are_recognised_by_their_turn(tmp_path: Path) -> None:
+    """As in bags; points of a vehicle at 10 m/s, compensated for the begin of each sweep."""
+    motion = EgoMotion(0, "lidar", (10.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    frames = []
+    for number in range(6):
+        sweep = turning_sweep(number)
+        share = np.arctan2(sweep.xyz_m[:, 1], sweep.xyz_m[:, 0]) / (2 * np.pi) + 0.5
+        xyz_m = deskew(sweep.xyz_m, share.astype(np.float64) * 0.1, *sensor_twist(motion, np.eye(4)))
+        assert sweep.ring is not None
+        np.savez(tmp_path / f"{number}.npz", xyz=xyz_m, ring=sweep.ring, time_offset_s=(share * 0.1).astype(np.float32))
+        twist = {"linear_mps": [10, 0, 0], "angular_radps": [0, 0, 0]}
+        stamp_ns = 1_000_000_000 + number * 100_000_000
+        frames.append({"image": "1.jpg", "cloud": f"{number}.npz", "stamp_ns": stamp_ns, "twist": twist})
+
+    def times_s(**changes: Any) -> tuple[list[str], np.ndarray]:
+        recording = open_source(str(a_dataset(tmp_path, frames=frames, **changes)))
+        assert isinstance(recording, FramewiseRecording)
+        sweeps = [message for message in recording.messages() if isinstance(message, LidarFrame)]
+        assert sweeps[0].time_offset_s is not None
+        return [one.code for one in recording.recognitions], sweeps[0].time_offset_s
+
+    codes, recognised_s = times_s()
+    assert codes == ["already_compensated"]
+    assert not recognised_s.any()
+    for no in ("no", False):
+        codes, given_s = times_s(compensated=no)
+        assert codes == []
+        assert np.ptp(given_s) > 0.09
+    assert times_s(compensated="middle")[1] == pytest.approx(0.05, abs=0.001)

@@ -22,7 +22,7 @@ from coec.errors import DecodeError
 from coec.io.depth.depth_maps import STEREO
 from coec.io.images import Inspector
 from coec.io.logs import LossCounter
-from coec.io.recordings.window_cutting import offset_cause
+from coec.io.recordings.clocks import offset_cause
 from coec.io.zenoh.bus import Bus, InputSample, StreamInput
 from coec.io.zenoh.ros_node import RosSide, RosTopicList, listed
 from coec.schemas.documents import Finding

@@ -11,6 +11,8 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from coec.calibration.frames.lidar_origin import NO_SCAN_LINES, ApparentOrigin, SeveralOrigins, from_origin
 from coec.calibration.types import CameraFrame, EgoMotion, Frame, FramePair, LidarFrame, Matrix4, Recognition, Rig
 from coec.config import CalibrationConfig
@@ -19,6 +21,7 @@ from coec.io.mcap.windows import is_window, read_window
 from coec.io.recordings import bag_index, bag_recognition, recording_source
 from coec.io.recordings.bag_recognition import PairMessages, Sweep, lidar_frame_of, rig_of_bag
 from coec.io.recordings.bag_storage import BagReader, BagStorage, open_storage
+from coec.io.recordings.clocks import header_clock_text
 from coec.io.recordings.cloud_files import measured_from
 from coec.io.recordings.recording_source import evenly_spread
 from coec.io.ros import message_decoding, messages
@@ -108,15 +111,22 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
         raise SourceError(f"{spec.path}: {camera_topic} holds no images, or no motion on the topic named for it")
     pair = PairMessages(camera_topic, camera, cloud, motion, query.get("intrinsics"), query.get("camera_frame"))
     rig, T_cloud_lidar, of_rig = _rig(index, pair, query)
-    if motion is not None and any(one.code == UNCONNECTED for one in of_rig):
+    if motion is not None and any(one.code == MOTION_LEFT_OUT for one in of_rig):
         streams = replace(streams, motion=[], moved=())
-    recognitions = (*_of_video(streams.video), *of_transforms, *of_rig, *(() if of_twists is None else (of_twists,)))
+    of_clocks = _of_clocks(index, (camera_topic, lidar_topic, streams.motion_topic), readings)
+    recognitions = (
+        *of_clocks,
+        *_of_video(streams.video),
+        *of_transforms,
+        *of_rig,
+        *(() if of_twists is None else (of_twists,)),
+    )
     name, start = f"{spec.path.name}{camera_topic}", rig.T_camera_lidar_nominal
     recording = BagRecording(name, rig, start, storage, streams, T_cloud_lidar, clouds, readings, recognitions)
     return recording.recognised()
 
 
-UNCONNECTED = "motion_frame_unconnected"
+MOTION_LEFT_OUT = "motion_frame_unconnected"
 """Code of the recognition that the motion is left out."""
 
 
@@ -149,7 +159,7 @@ def _connected(
         f"{lidar_frame!a}: it is left out, and nothing is compensated for motion. Record /tf_static of the whole "
         f"vehicle, or name a frame with its axes: ?odometry_frame=NAME ({lidar_frame}: the motion is the LiDAR's own)."
     )
-    return None, Recognition(UNCONNECTED, text, "warn")
+    return None, Recognition(MOTION_LEFT_OUT, text, "warn")
 
 
 def _window_recording(path: Path) -> recording_source.FramewiseRecording:
@@ -177,6 +187,7 @@ class PairStreams:
     Attributes:
         moved: the motion itself, instead of `motion`, if it was taken from transforms; ascending by stamp.
         video: the packets of the camera, if its topic is one of video.
+        motion_topic: where the motion comes from.
     """
 
     camera: list[bag_index.MessageLocation]
@@ -184,6 +195,7 @@ class PairStreams:
     motion: list[bag_index.MessageLocation]
     moved: tuple[EgoMotion, ...] = ()
     video: VideoTrack | None = None
+    motion_topic: str | None = None
 
     @property
     def motions(self) -> list[bag_index.MessageLocation | EgoMotion]:
@@ -370,7 +382,20 @@ def _streams(
     images = index.streams[camera]
     # One frame is left, see `require_one_frame`.
     video = images.videos.get(bare(images.locations[0].frame_id))
-    return PairStreams(images.ordered(), sweeps, places, moved, video), of_twists
+    return PairStreams(images.ordered(), sweeps, places, moved, video, motion_source), of_twists
+
+
+def _of_clocks(
+    index: bag_index.BagIndex, topics: Sequence[str | None], readings: bag_recognition.Readings
+) -> tuple[Recognition, ...]:
+    """What to tell of the clocks in the headers on the topics of camera, LiDAR and motion."""
+    offsets_ns = (readings.camera_offset_ns, readings.lidar_offset_ns, 0)
+    known = {topic: index.streams[topic] for topic in topics if topic is not None and topic in index.streams}
+    shifts_s = {topic: 1e-9 * offset_ns for topic, offset_ns in zip(topics, offsets_ns, strict=True)}
+    lags_s = {topic: (np.array(stream.lags_s) - shifts_s[topic]).tolist() for topic, stream in known.items()}
+    firsts_s = {topic: 1e-9 * stream.locations[0].stamp_ns for topic, stream in known.items()}
+    text = header_clock_text(lags_s, firsts_s)
+    return (Recognition("header_clock", f"By the times of receipt, {text}.", "warn"),) if text else ()
 
 
 def _require_stamps(index: bag_index.BagIndex, topic: str) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 import sys
+from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -109,11 +110,13 @@ class TopicStream:
 
     Attributes:
         videos: of a topic of video, the packets by the frame that they name; `locations` has those of pictures.
+        lags_s: seconds from the stamp of each message until the recorder received it.
     """
 
     type_name: str
     locations: list[MessageLocation] = field(default_factory=list)
     videos: dict[str, VideoTrack] = field(default_factory=dict)
+    lags_s: array[float] = field(default_factory=lambda: array("d"))
 
     def ordered(self) -> list[MessageLocation]:
         """The places in the order of their stamps."""
@@ -278,6 +281,7 @@ class BagIndex:
             if name in (messages.COMPRESSED_IMAGE, *VIDEO_TYPES) and not self._is_picture(entry, stream, frame_id):
                 return
             stream.locations.append(MessageLocation(stamp_ns, entry.place, name, frame_id))
+            stream.lags_s.append((entry.logged_ns - stamp_ns) * 1e-9)
         elif name == messages.CAMERA_INFO:
             self._decoded(entry, self.infos.setdefault(entry.topic, camera_info.CameraInfos()).add)
         elif name == messages.TF and entry.topic == TF_STATIC:

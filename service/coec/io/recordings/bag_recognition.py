@@ -10,7 +10,7 @@ A person can say otherwise in the query of the bag; every recognition names the 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -297,7 +297,7 @@ def joined(clouds: Sequence[LidarFrame], stamp_ns: int) -> LidarFrame:
 
 
 def compensated(
-    sweeps: Iterator[LidarFrame], motions: Sequence[EgoMotion], T_lidar_ego: Matrix4
+    sweeps: Iterable[LidarFrame], motions: Sequence[EgoMotion], T_lidar_ego: Matrix4, override: str = "?compensated=no"
 ) -> tuple[str | None, Recognition | None]:
     """The instant for which the points of these sweeps were compensated before they were recorded, as a name in
     `sweep_evidence.instants_s`, None: for none; and what to tell."""
@@ -311,7 +311,7 @@ def compensated(
         return None, None
     text = (
         f"The points were compensated for motion before they were recorded, for the {instant} of each sweep, because "
-        "undoing that makes their turn even: they are not compensated again. If that is wrong, say ?compensated=no."
+        f"undoing that makes their turn even: they are not compensated again. If that is wrong, say {override}."
     )
     return instant, Recognition("already_compensated", text)
 

@@ -27,6 +27,7 @@ from coec.config import PointTimeConfig
 from coec.errors import DecodeError, SourceError
 from coec.geometry.points import lengths
 from coec.io.frame_validation import Refusal, finite_rows
+from coec.io.recordings.las import columns_of_las
 from coec.io.ros.point_clouds import FIELDS, offsets_s
 from coec.io.user_files import read_bytes, read_npy, read_npz
 
@@ -406,7 +407,7 @@ class CloudLayout:
 
 
 def load_cloud(stamp_ns: int, frame_id: str, path: Path, layout: CloudLayout = CloudLayout()) -> LidarFrame:
-    """A sweep from a `.pcd`, `.ply`, `.bin`, `.npy` or `.npz` file, by its suffix.
+    """A sweep from a `.pcd`, `.ply`, `.las`, `.bin`, `.npy` or `.npz` file, by its suffix.
 
     `.npy` holds a table of floats (N, 3) or more, x y z [intensity ...], or rows with named fields. `.npz` holds `xyz`
     (N, 3) and may hold `intensity`, `ring` and `time_offset_s`, each (N,). Metres, seconds after `stamp_ns`.
@@ -451,7 +452,7 @@ def measured_from(
     if median_m > FARTHEST_MEDIAN_M:
         raise SourceError(
             f"{where}: half of the points are farther than {median_m:.0f} m: coordinates are in metres, "
-            "so divide millimetres by 1000"
+            "from the LiDAR, so divide millimetres by 1000, and write points of a map in the frame of the LiDAR"
         )
     check = OriginCheck()
     contradiction = check.inspect(sweep)
@@ -518,6 +519,8 @@ def _columns(path: Path, layout: CloudLayout) -> tuple[Columns, tuple[Recognitio
             return _fields(parse_pcd(data)), _of_viewpoint(viewpoint_of(data), path)
         case ".ply":
             return _fields(parse_ply(read_bytes(path))), ()
+        case ".las" | ".laz":
+            return columns_of_las(read_bytes(path), path, MAX_POINTS), ()
         case ".bin":
             data = read_bytes(path)
             names = layout.columns or _columns_of_bin(path, np.frombuffer(data, np.uint8))
@@ -531,7 +534,7 @@ def _columns(path: Path, layout: CloudLayout) -> tuple[Columns, tuple[Recognitio
         case ".npz":
             return _of_npz(path), ()
         case _:
-            raise SourceError(f"{path}: clouds are .pcd, .ply, .bin, .npy or .npz files")
+            raise SourceError(f"{path}: clouds are .pcd, .ply, .las, .bin, .npy or .npz files")
 
 
 def _of_viewpoint(viewpoint: str, path: Path) -> tuple[Recognition, ...]:

@@ -7,12 +7,12 @@ stamp of the image.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
@@ -23,6 +23,7 @@ from ruamel.yaml.error import YAMLError
 from ruamel.yaml.nodes import CollectionNode, MappingNode, Node
 
 from coec.calibration import types
+from coec.calibration.frames import sweep_evidence
 from coec.calibration.frames.lidar_origin import ApparentOrigin, SeveralOrigins
 from coec.calibration.search.mistakes import INVERSE_POSE
 from coec.config import (
@@ -41,9 +42,17 @@ from coec.geometry import cameras, se3
 from coec.geometry.cameras import Camera
 from coec.io.images import encode_depth_png, probe, raw_image
 from coec.io.intrinsics_files import cameras_of, load_camera_document, with_camera
+from coec.io.recordings import bag_recognition
 from coec.io.recordings.cloud_files import MAX_COLUMNS, CloudLayout, load_cloud, measured_from
 from coec.io.recordings.kitti import load_image
-from coec.io.recordings.recording_source import FramewiseRecording, RecordedFrame, SourceSpec, is_bag, parse_spec
+from coec.io.recordings.recording_source import (
+    FramewiseRecording,
+    RecordedFrame,
+    SourceSpec,
+    evenly_spread,
+    is_bag,
+    parse_spec,
+)
 from coec.io.rig_files import camera_of, load_mask
 from coec.io.user_files import read_bytes, read_npy, write_output
 
@@ -98,6 +107,10 @@ class ManifestDocument(_Strict):
     )
     cloud_time: PointTimeConfig | None = Field(
         default=None, description="how the points of .pcd, .ply, .bin and .npy are timed, if their values leave it open"
+    )
+    compensated: Literal[False, "no", "stamp", "begin", "middle", "end"] | None = Field(
+        default=None,
+        description="instant of the sweep for which points were compensated for motion before they were written",
     )
     frames: tuple[FrameDocument, ...] = Field(min_length=1)
 
@@ -166,13 +179,37 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
         for frame in frames
         if frame.twist is not None
     ]
-    return FramewiseRecording(
+    recording = FramewiseRecording(
         f"{path.parent.name}/{document.pair}",
         rig,
         T_camera_lidar,
         tuple(_recorded(path.parent, frame, scale, T_cloud_lidar, layout) for frame in frames),
         tuple(motions),
     )
+    if document.compensated is None:
+        instant, recognition = _compensated(recording)
+    else:  # YAML 1.1 reads `no` as false
+        instant, recognition = document.compensated or "no", None
+    if instant in (None, "no"):
+        return recording
+    return replace(
+        recording,
+        frames=tuple(replace(frame, load_lidar=partial(_at, frame.load_lidar, instant)) for frame in recording.frames),
+        recognitions=() if recognition is None else (recognition,),
+    )
+
+
+def _compensated(recording: FramewiseRecording) -> tuple[str | None, types.Recognition | None]:
+    """See `bag_recognition.compensated`, of some sweeps at which the vehicle is known to drive."""
+    driving = {m.stamp_ns for m in recording.motions if m.reaches(sweep_evidence.LEAST_SPEED_MPS)}
+    moving = [frame for frame in recording.frames if frame.camera_stamp_ns in driving]
+    sampled = [moving[index] for index in evenly_spread(len(moving), bag_recognition.SAMPLED_SWEEPS)]
+    sweeps = (frame.load_lidar() for frame in sampled)
+    return bag_recognition.compensated(sweeps, recording.motions, np.eye(4), "`compensated: no` in the dataset.yaml")
+
+
+def _at(load: Callable[[], types.LidarFrame], instant: str) -> types.LidarFrame:
+    return bag_recognition.as_compensated(load(), instant)
 
 
 def _check_frames(path: Path, frames: Sequence[FrameDocument]) -> None:
