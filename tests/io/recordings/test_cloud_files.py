@@ -217,7 +217,7 @@ def test_numpy_files_that_lie(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 def test_unknown_suffix_and_absent_file(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="clouds are"):
-        load_cloud(0, "lidar", tmp_path / "cloud.las")
+        load_cloud(0, "lidar", tmp_path / "cloud.xyz")
     with pytest.raises(SourceError, match="does not exist"):
         load_cloud(0, "lidar", tmp_path / "cloud.pcd")
 
