@@ -117,6 +117,7 @@ from support.ros import (
     transforms,
     twist,
     twist_with_covariance,
+    velodyne_scan,
 )
 from support.vehicles import InstantDiskWriter
 from support.video import encoded, parameters, pictures, slice_of
@@ -181,6 +182,7 @@ MESSAGES: Final = (
     messages.TWIST_WITH_COVARIANCE,
     messages.IMU,
     "livox_ros_driver2/msg/CustomMsg",
+    messages.VELODYNE_SCAN,
 )
 
 
@@ -237,6 +239,7 @@ def _cdr_seeds() -> list[bytes]:
         (6, twist_with_covariance()),
         (7, imu()),
         (8, LIVOX),
+        (9, velodyne_scan(2)),
     ]
     return [bytes([kind]) + message for kind, message in messages]
 

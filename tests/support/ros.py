@@ -130,6 +130,27 @@ def twist_with_covariance() -> bytes:
     return packer.put("d", *[0.0] * 36).done()
 
 
+def velodyne_packet(azimuth_cdeg: int, model: int = 0x22, distance_m: float = 5.0, time_us: int = 0) -> bytes:
+    """A packet of a VLP-16: 12 blocks of twice 16 beams, all at one distance, each with its own intensity."""
+    blocks = b"".join(
+        struct.pack("<HH", 0xEEFF, (azimuth_cdeg + 40 * block) % 36_000)
+        + b"".join(struct.pack("<HB", round(distance_m / 0.002), beam) for beam in range(32))
+        for block in range(12)
+    )
+    return blocks + struct.pack("<IBB", time_us, 0x37, model)
+
+
+def velodyne_scan(count: int = 75, *, stamped_first: bool = False, packet: bytes | None = None) -> bytes:
+    """A `VelodyneScan` of packets 1.327 ms apart, the last or the first of which has the stamp of its header."""
+    begin_ns = STAMP_NS if stamped_first else STAMP_NS - (count - 1) * 1_327_000
+    packer = Packer().header("velodyne").put("I", count)
+    for number in range(count):
+        sec, nsec = divmod(begin_ns + number * 1_327_000, 10**9)
+        packer.put("i", sec).put("I", nsec)
+        packer.body += velodyne_packet(480 * number, time_us=1327 * number) if packet is None else packet
+    return packer.done()
+
+
 def imu(angular: tuple[float, ...] = (0.0, 0.5, 0.125), known: float = 0.0, frame_id: str = "imu_link") -> bytes:
     packer = Packer().header(frame_id).put("d", 0.0, 0.0, 0.0, 1.0).put("d", *[0.0] * 9)
     packer.put("d", *angular).put("d", known, *[0.0] * 8)

@@ -95,7 +95,7 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
     storage = open_storage(spec.path)
     index = bag_index.build_index(storage, clouds)
     camera_topic = index.camera_topic(query.get("camera"))
-    lidar_topic = index.topic(bag_index.CLOUD_TYPES, query.get("points"), "points")
+    lidar_topic = index.lidar_topic(query.get("points"))
     index.require_one_frame(camera_topic, query.get("camera_frame"), "camera_frame")
     index.require_one_frame(lidar_topic, query.get("lidar_frame"), "lidar_frame")
     with storage.open() as reader:

@@ -74,7 +74,7 @@ class CloudDecoder:
 
 VIDEO_TYPES = (messages.FFMPEG_PACKET, messages.COMPRESSED_VIDEO)
 IMAGE_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE, *VIDEO_TYPES)
-CLOUD_TYPES = (messages.POINT_CLOUD, *point_clouds.TYPES)
+CLOUD_TYPES = (messages.POINT_CLOUD, *point_clouds.TYPES, messages.VELODYNE_SCAN)
 VELOCITY_TYPES = (messages.ODOMETRY, messages.TWIST, messages.TWIST_WITH_COVARIANCE)
 ROTATION_TYPES = (messages.IMU,)
 
@@ -158,7 +158,8 @@ class BagIndex:
         topic = self.optional_topic(types, requested, key)
         if topic is None:
             advice = "".join(f"; {other} has {text}" for other, text in self.unread.items())
-            named = " or ".join(name for name in types if name not in (*point_clouds.TYPES, *VIDEO_TYPES))
+            others = (*point_clouds.TYPES, *VIDEO_TYPES, messages.VELODYNE_SCAN)
+            named = " or ".join(name for name in types if name not in others)
             raise SourceError(f"{self.path} has no message of type {named}{advice}")
         return topic
 
@@ -198,6 +199,15 @@ class BagIndex:
                 "of type IDR (H.264) or IRAP (H.265), with their parameter sets: let the encoder send one each second"
             )
         return topic
+
+    def lidar_topic(self, requested: str | None) -> str:
+        """The topic of clouds that was asked for, else the only one of points, else the only one of packets.
+
+        Raises:
+            SourceError: as `topic`.
+        """
+        of_points = [topic for topic, one in self.streams.items() if one.type_name in CLOUD_TYPES[:-1]]
+        return self.topic(CLOUD_TYPES, of_points[0] if not requested and len(of_points) == 1 else requested, "points")
 
     def transform(self, target: str, source: str) -> Matrix4 | None:
         """T_target_source (4, 4) along the static transforms; None if they do not connect the two frames.

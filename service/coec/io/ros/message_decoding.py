@@ -26,6 +26,7 @@ from coec.io.frame_validation import MAX_SPEED, Refusal, check_size
 from coec.io.images import BYTES_PER_PIXEL, eight_bits, probe, raw_image
 from coec.io.ros import messages, point_clouds
 from coec.io.ros.messages import check_cloud_fields, check_header, deserialized, frame_id, stamp_ns
+from coec.io.ros.velodyne import cloud_of_scan
 
 SEMIPLANAR: Final = {"nv12": (0, 1), "nv21": (1, 0)}
 """Where U and V stand in the pairs of the second plane, by `Image.encoding`."""
@@ -323,20 +324,27 @@ _VIDEO: Final = (
 )
 _PACKED: Final = (
     "clouds packed by point_cloud_transport (Draco, Cloudini, zlib) are not read: unpack them with `ros2 run "
-    "point_cloud_transport republish`, and take the topic of PointCloud2"
+    "point_cloud_transport republish` (of a file packed by Cloudini, `cloudini_rosbag_converter -d`), and take the "
+    "topic of PointCloud2"
 )
-_PACKETS: Final = "packets of the LiDAR are no points: take the topic on which its driver sends PointCloud2"
+_PACKETS: Final = (
+    "packets of the LiDAR are no points: take the topic of PointCloud2 of its driver, or convert them with "
+)
+_OUSTER: Final = f"{_PACKETS}`ros2 launch ouster_ros replay.launch.xml`, which needs the sensor's metadata"
+_HESAI: Final = f"{_PACKETS}hesai_ros_driver, `source_type: 3` in its config.yaml (packets from a bag)"
 
 REFUSED: Final = {
     messages.FFMPEG_PACKET: _VIDEO,
     messages.COMPRESSED_VIDEO: _VIDEO,
     "foxglove_msgs/msg/CompressedPointCloud": _PACKED,
     "theora_image_transport/msg/Packet": _VIDEO,
-    "velodyne_msgs/msg/VelodyneScan": _PACKETS,
-    "ouster_sensor_msgs/msg/PacketMsg": _PACKETS,
-    "ouster_msgs/msg/PacketMsg": _PACKETS,
-    "hesai_ros_driver/msg/UdpFrame": _PACKETS,
-    "rslidar_msg/msg/RslidarPacket": _PACKETS,
+    messages.VELODYNE_SCAN: f"{_PACKETS}velodyne_pointcloud (velodyne_transform_node)",
+    "ouster_sensor_msgs/msg/PacketMsg": _OUSTER,
+    "ouster_msgs/msg/PacketMsg": _OUSTER,
+    "ouster_ros/msg/PacketMsg": _OUSTER,
+    "hesai_ros_driver/msg/UdpFrame": _HESAI,
+    "pandar_msgs/msg/PandarScan": f"{_PACKETS}the driver of Hesai or nebula_ros",
+    "rslidar_msg/msg/RslidarPacket": f"{_PACKETS}rslidar_sdk, `msg_source: 2` in its config.yaml (packets from ROS)",
     "point_cloud_interfaces/msg/CompressedPointCloud2": _PACKED,
     "sensor_msgs/msg/PointCloud": "PointCloud has been replaced by PointCloud2: convert it (point_cloud_converter)",
     messages.TF: "a transform tells where a frame is, not what it sees; it counts as motion if `ego.type` is this one",
@@ -373,6 +381,8 @@ def decode(
             check_cloud_fields(payload)
             message = deserialized(ros.sensor_msgs__msg__PointCloud2, payload)
             return _point_cloud(message, limits, point_time, source)
+        case messages.VELODYNE_SCAN:
+            return _point_cloud(cloud_of_scan(payload), limits, point_time, source)
         case _ if type_name in point_clouds.TYPES:
             return _point_cloud(point_clouds.cloud_of_cdr(payload), limits, point_time, source)
         case _:

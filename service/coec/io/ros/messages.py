@@ -26,10 +26,13 @@ DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
 
 FFMPEG_PACKET: Final = "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
 COMPRESSED_VIDEO: Final = "foxglove_msgs/msg/CompressedVideo"
+VELODYNE_SCAN: Final = "velodyne_msgs/msg/VelodyneScan"
 
 _DEFINITIONS: Final = {
     FFMPEG_PACKET: "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\nuint64 pts\nuint8 flags\n"
     "bool is_bigendian\nuint8[] data\n",
+    "velodyne_msgs/msg/VelodynePacket": "builtin_interfaces/Time stamp\nuint8[1206] data\n",
+    VELODYNE_SCAN: "std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets\n",
     COMPRESSED_VIDEO: "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n",
 }
 """Of types that are not ROS's own."""
