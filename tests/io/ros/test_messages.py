@@ -290,7 +290,9 @@ def test_a_type_that_is_not_read_is_refused() -> None:
     [
         ("point_cloud_interfaces/msg/CompressedPointCloud2", "republish"),
         ("ffmpeg_image_transport_msgs/msg/FFMPEGPacket", "JPEG"),
-        ("velodyne_msgs/msg/VelodyneScan", "PointCloud2"),
+        ("ouster_sensor_msgs/msg/PacketMsg", "PointCloud2.*replay.launch"),
+        ("hesai_ros_driver/msg/UdpFrame", "source_type: 3"),
+        ("rslidar_msg/msg/RslidarPacket", "msg_source: 2"),
     ],
 )
 def test_a_type_that_people_take_for_the_right_one_is_refused_with_what_to_do(type_name: str, advice: str) -> None:
