@@ -316,5 +316,5 @@ def test_a_drive_as_video_decides_within_one_sigma_of_the_same_drive_as_pictures
     assert native.accepted
     assert of_video.accepted
     distance = np.abs(of_video.correction[:3] - native.correction[:3]) / native.sigma[:3]
-    record_property("figure", f"{encoder}: {distance.max():.2f} standard deviations distance")
+    record_property("figure", f"{encoder}: {distance.max():.2f} standard deviations")
     assert distance.max() < 1.0
