@@ -10,17 +10,19 @@ import pytest
 from numpy.typing import NDArray
 
 from coec.calibration.baseline import Accuracy, MonitorLimits
-from coec.calibration.monitor.check import Check, CheckInput, Expected, Support, check_at, gather, support
-from coec.calibration.monitor.check_edges import MIN_CONTRAST
-from coec.calibration.monitor.check_verdict import (
+from coec.calibration.monitor.check import (
     MIN_EDGES_IN_VIEW,
     MIN_INDEPENDENT_SAMPLES,
-    TELLING_CONTRAST,
-    Opinion,
-    judge_check,
-    opinion,
-    over_limits,
+    Check,
+    CheckInput,
+    Expected,
+    Support,
+    check_at,
+    gather,
+    support,
 )
+from coec.calibration.monitor.check_edges import MIN_CONTRAST
+from coec.calibration.monitor.check_verdict import TELLING_CONTRAST, Opinion, judge_check, opinion, over_limits
 from coec.calibration.objective.landscape import axis_derivatives, measure_curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.solver import prepare_window_data

@@ -1,13 +1,16 @@
-"""A look: what it asks of whom, and that sensors prepared once serve every pair of a rig."""
+"""A look: what it asks of whom, that sensors prepared once serve every pair of a rig, and what reflectance adds."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from coec.calibration.monitor.check import check_at, gather, join, seen_part
+from calibration.conftest import window_of
+from coec.calibration.monitor.check import Check, check_at, gather, join, seen_part
 from coec.calibration.monitor.check_edges import OUTLINE_RAD, REACH_RAD, outline, prepare_images, prepare_sweep, union
 from coec.calibration.monitor.check_verdict import diagnose, observe
 from coec.calibration.solver import WindowData, prepare_window_data
@@ -16,6 +19,7 @@ from coec.config import CalibrationConfig, LimitsConfig
 from coec.geometry import se3
 from coec.geometry.edges.image_edges import Rectangle
 from coec.io.images import GreyImages
+from support.simulated_drives import rendered_source
 
 CONFIG = CalibrationConfig()
 IMAGES = GreyImages(LimitsConfig())
@@ -110,3 +114,70 @@ def test_edges_behind_the_camera_have_no_outline(six: Window) -> None:
 
 def test_the_least_part_that_holds_others() -> None:
     assert union([Rectangle(4, 9, 10, 5), Rectangle(2, 11, 6, 8)]) == Rectangle(2, 9, 12, 10)
+
+
+MOTORWAY = "sim:scene=highway&seed=71&seconds=5.4&camera_hz=1.2&lidar_hz=1.2&ego_hz=20&lidar=64&camera=pinhole600x300"
+"""Six pairs: lane markings, guard rails and little else."""
+
+
+@pytest.fixture(scope="module")
+def motorway() -> Window:
+    return window_of(rendered_source(MOTORWAY))
+
+
+def with_reflectance(window: Window, changed: Callable[[NDArray[np.float32]], NDArray[np.float32] | None]) -> Window:
+    """The window with other values of reflectance in every sweep."""
+    pairs = []
+    for pair in window.pairs:
+        assert pair.lidar.intensity is not None
+        pairs.append(replace(pair, lidar=replace(pair.lidar, intensity=changed(pair.lidar.intensity))))
+    return replace(window, pairs=tuple(pairs))
+
+
+def checked(window: Window, depth: DepthModel) -> Check:
+    return check_at(gather(window_data(window, depth)), window.T_camera_lidar_start)
+
+
+def off_deg(seen: Check, window: Window) -> float:
+    return float(np.degrees(np.linalg.norm(se3.difference(seen.T_rotation, window.rig.T_camera_lidar_nominal)[:3])))
+
+
+class TestReflectance:
+    def test_is_not_read_where_range_edges_are_clear(self, six: Window, stereo: DepthModel) -> None:
+        without = checked(with_reflectance(six, lambda _: None), stereo)
+        seen = checked(six, stereo)
+        assert seen.by_range is None
+        np.testing.assert_array_equal(seen.T_pose, without.T_pose)
+
+    def test_paint_determines_the_pose_on_a_motorway(self, motorway: Window, stereo: DepthModel) -> None:
+        without = checked(with_reflectance(motorway, lambda _: None), stereo)
+        seen = checked(motorway, stereo)
+        assert seen.by_range is not None
+        assert seen.contrast > without.contrast
+        assert seen.balance[1] > 0.0
+        assert off_deg(seen, motorway) < 0.15
+
+    def test_edges_of_both_kinds_find_the_mount_again(self, motorway: Window, stereo: DepthModel) -> None:
+        for axis in range(3):
+            start = moved(motorway, [*np.eye(3)[axis] * np.radians(1.0), 0.0, 0.0, 0.0])
+            seen = checked(start, stereo)
+            assert off_deg(seen, motorway) < 0.3
+            assert seen.of_rotation.insists
+
+    @pytest.mark.fault("reflectance is absent, constant, noise, or shuffled", "the look is that by range alone")
+    def test_useless_values_change_nothing(
+        self, motorway: Window, stereo: DepthModel, record_property: Callable[[str, object], None]
+    ) -> None:
+        rng = np.random.default_rng(3)
+        useless: dict[str, Callable[[NDArray[np.float32]], NDArray[np.float32] | None]] = {
+            "absent": lambda _: None,
+            "constant": lambda values: np.full_like(values, 7.0),
+            "unknown": lambda values: np.full_like(values, np.nan),
+            "noise": lambda values: rng.uniform(0.0, 255.0, len(values)).astype(np.float32),
+            "other beams": lambda values: rng.permutation(values),
+        }
+        seen = {name: checked(with_reflectance(motorway, changed), stereo) for name, changed in useless.items()}
+        for one in seen.values():
+            np.testing.assert_array_equal(one.T_pose, seen["absent"].T_pose)
+            assert one.contrast == seen["absent"].contrast
+        record_property("figure", f"{len(seen)} of {len(seen)} looks equal to the byte")

@@ -16,8 +16,8 @@ clear and confirm the pose.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from math import fsum
 
 import numpy as np
@@ -34,10 +34,20 @@ from coec.calibration.types import FramePair, Matrix4, Rig, Silence
 from coec.calibration.uncertainty.covariance import measure_noise
 from coec.config import CalibrationConfig
 from coec.geometry import se3
-from coec.geometry.cameras import in_image
-from coec.geometry.edges.alignment import EdgeFrames, frame_alignment
+from coec.geometry.edges.alignment import frame_alignment
 from coec.geometry.edges.image_edges import Rectangle
-from coec.geometry.projection import project
+
+CLEAR_CONTRAST = 15.0
+"""Contrast from which range edges alone tell enough: a check then scatters as on a street, or half as far again."""
+
+MIN_EDGES_IN_VIEW = 150.0
+"""With fewer range edges in view per pair a check's edges count as faint, however well they fit: a guard rail and a
+lane marking then decide, the same in every pair. See docs/measured.md."""
+
+MIN_INDEPENDENT_SAMPLES = 2.0
+"""If the pairs of a moving vehicle are worth fewer independent samples, the edges of a check count as faint. Frames
+that say the same although the vehicle has moved on, as between the guard rails of a highway, are all wrong if one is,
+and so is the next check. See docs/measured.md."""
 
 CERTAIN = normal_quantile(0.95)
 """Standard deviations from which a gain is more than chance."""
@@ -91,12 +101,14 @@ AT_POSE = Expected(np.zeros(6), np.zeros(6))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckInput:
-    """Some pairs with all that a check at any pose needs. Entries are per pair, in order. `features` compare depth with
-    ranges; calling it infers the depth, and raises CalibrationError if a frame has none."""
+    """Some pairs with all that a check at any pose needs. Entries are per pair, in order. `edges` are those of range;
+    calling `both` adds those of reflectance. `features` compare depth with ranges; calling it infers the depth, and
+    raises CalibrationError if a frame has none."""
 
     rig: Rig
     pairs: tuple[FramePair, ...]
     edges: check_edges.ProjectedEdges
+    both: Callable[[], check_edges.ProjectedEdges]
     scenes: tuple[SceneFacts, ...]
     features: Callable[[], tuple[Features, ...]]
 
@@ -106,6 +118,7 @@ class CheckInput:
             self.rig,
             tuple(self.pairs[i] for i in indices),
             self.edges.of(indices),
+            cache(lambda: self.both().of(indices)),
             tuple(self.scenes[i] for i in indices),
             lambda: tuple(self.features()[i] for i in indices),
         )
@@ -121,13 +134,15 @@ class Check:
         offset_rotation, offset_pose: (6,) ξ from the pose to these optima (rad, m).
         edges: significance of the edges at the pose.
         edges_at_best: their significance at the local optimum over rotations.
-        edges_in_view: number of range edges, of all pairs, that lie in the images at that optimum.
+        edges_in_view: effective number of edges, of all pairs, that lie in the images at that optimum.
         looks: how many independent looks the pairs are worth over rotations, see `Noise`; 1 if that is unknown.
         scatter_rad: (3,) standard deviation of the optimum over rotations from how its pairs and sectors differ, see
             `Noise`; 0 if that is unknown.
         of_rotation, of_pose: how far the edges insist on these optima.
         contrast: how far the edges at the local optimum over rotations stand above other poses, standard deviations.
-        overlap: range edges in view at the pose over those that come into view within reach.
+        overlap: edges in view at the pose over those that come into view within reach.
+        balance: (KINDS,) weights of the kinds of edges, see `ProjectedEdges`.
+        by_range: the check by range edges alone, if this one is by both kinds.
     """
 
     pairs: int
@@ -137,13 +152,15 @@ class Check:
     offset_pose: NDArray[np.float64]
     edges: float
     edges_at_best: float
-    edges_in_view: int
+    edges_in_view: float
     independent_samples: float
     scatter_rad: NDArray[np.float64]
     of_rotation: Support
     of_pose: Support
     contrast: float
     overlap: float
+    balance: NDArray[np.float64] = field(default_factory=lambda: np.array([1.0, 0.0]))
+    by_range: Check | None = None
 
 
 def gather(data: WindowData, beyond_rad: float = 0.0) -> CheckInput:
@@ -183,9 +200,10 @@ def join(
     the pairs of `sight`, in order. Poses within `reach_rad` of the start of `sight` can be checked."""
     window = data.window
     pose = window.T_camera_lidar_start
-    edges = check_edges.project_edges(
-        window.rig, window.pairs, sweeps, images, pose, reach_rad, compensated=data.compensated
-    )
+    project = partial(
+        check_edges.project_edges,
+        window.rig, window.pairs, sweeps, images, pose, reach_rad, compensated=data.compensated,
+    )  # fmt: skip
     scenes = tuple(
         SceneFacts(
             pair.stamp_ns,
@@ -197,19 +215,31 @@ def join(
         for pair, picture, sweep in zip(window.pairs, images.facts, sweeps, strict=True)
     )
     features = cache(lambda: tuple(depth_features(data, pose, DEPTH_POINTS)))
-    return CheckInput(window.rig, window.pairs, edges, scenes, features)
+    both = cache(lambda: project(with_reflectance=True))
+    return CheckInput(window.rig, window.pairs, project(), both, scenes, features)
 
 
 def check_at(evidence: CheckInput, pose: Matrix4, expected: Expected = AT_POSE) -> Check:
-    """A check at `pose` (4, 4)."""
-    edges = evidence.edges
-    optima = check_edges.search_local_optima(edges, pose)
+    """A check at `pose` (4, 4): by range edges, and by both kinds where these leave a doubt."""
+    check = _check_by(evidence, check_edges.search_local_optima(evidence.edges, pose), pose, expected)
+    clear = check.contrast >= CLEAR_CONTRAST and check.edges_in_view >= MIN_EDGES_IN_VIEW * check.pairs
+    if clear and check.independent_samples >= MIN_INDEPENDENT_SAMPLES:
+        return check
+    optima = check_edges.search_with_reflectance(evidence.both(), pose, check.T_rotation)
+    # What stands out less from other poses has nothing to add.
+    if optima is None or optima.contrast <= check.contrast:
+        return check
+    return replace(_check_by(evidence, optima, pose, expected), by_range=check)
+
+
+def _check_by(evidence: CheckInput, optima: check_edges.LocalOptima, pose: Matrix4, expected: Expected) -> Check:
+    edges = optima.edges
     cells = edges.cells(optima.T_rotation)
     landscape = Landscape.about(cells, optima.T_rotation, tuple(range(check_edges.ROTATION_DOF)))
     noise = measure_noise(landscape)
     poses = (se3.perturb(pose, expected.rotation), optima.T_pose, se3.perturb(pose, expected.pose))
     at_expected_turn, at_pose, at_expected_pose = cells.at(np.stack(poses))
-    whole, sharp = edges.whole.frames, edges.sharp.frames
+    whole = edges.whole.frames
     return Check(
         pairs=len(evidence.pairs),
         T_rotation=optima.T_rotation,
@@ -218,20 +248,15 @@ def check_at(evidence: CheckInput, pose: Matrix4, expected: Expected = AT_POSE) 
         offset_pose=se3.difference(optima.T_pose, pose),
         edges=frame_alignment(whole, pose).significance,
         edges_at_best=frame_alignment(whole, optima.T_rotation).significance,
-        edges_in_view=_in_view(sharp, optima.T_rotation),
+        edges_in_view=edges.count(optima.T_rotation),
         independent_samples=1.0 if noise is None else noise.independent_samples,
         scatter_rad=np.zeros(3) if noise is None else np.sqrt(np.diag(noise.covariance)),
         of_rotation=support(landscape.centre, at_expected_turn),
         of_pose=support(at_pose, at_expected_pose),
         contrast=optima.contrast,
-        overlap=_in_view(sharp, pose) / max(len(sharp.weight), 1),
+        overlap=edges.count(pose) / max(edges.count(), 1.0),
+        balance=edges.balance,
     )
-
-
-def _in_view(edges: EdgeFrames, T_camera_lidar: Matrix4) -> int:
-    """How many range edges lie in the images."""
-    uv_px, valid = project(edges.camera, check_edges.placed(edges, T_camera_lidar))
-    return int(np.count_nonzero(valid & in_image(edges.camera, uv_px)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

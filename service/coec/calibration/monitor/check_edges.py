@@ -42,7 +42,8 @@ from coec.geometry.edges import alignment
 from coec.geometry.edges.charts import moved_by, select_separated, unit_ball
 from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, MEAN_RADIUS_PX, EdgeScales, Rectangle
 from coec.geometry.edges.range_edges import range_edges
-from coec.geometry.edges.scan_lines import scan_lines
+from coec.geometry.edges.reflectance_edges import learn_noise, reflectance_edges, reflectance_steps
+from coec.geometry.edges.scan_lines import ScanLines, SweepEdges, scan_lines
 from coec.geometry.images import level_counts, neighbour_differences
 from coec.geometry.points import thinned
 from coec.geometry.projection import project
@@ -98,13 +99,17 @@ class PreparedSweep:
     """A sweep of one LiDAR.
 
     Attributes:
-        edges: the sweep reduced to its range edges, as measured.
+        sweep: as measured.
+        edges: the sweep reduced to its range edges.
         weight: (E,) float32, weight of each range edge; see `SweepEdges`.
+        lines: its scan lines.
         facts: what the sweep shows of the sensor itself.
     """
 
+    sweep: LidarFrame
     edges: LidarFrame
     weight: NDArray[np.float32]
+    lines: ScanLines
     facts: sensor_faults.SweepFacts
 
 
@@ -138,12 +143,18 @@ def prepare_sweep(sweep: LidarFrame) -> PreparedSweep:
     """The range edges of a sweep, and what the sweep shows of the LiDAR. Only these points are placed, and only later,
     because every pair places them at the instant of another exposure."""
     seen = bearings(sweep.xyz_m)
-    detected = range_edges(scan_lines(sweep.xyz_m, sweep.ring, seen))
-    offsets_s = None if sweep.time_offset_s is None else sweep.time_offset_s[detected.index]
+    lines = scan_lines(sweep.xyz_m, sweep.ring, seen)
+    detected = range_edges(lines)
+    facts = sweep_facts(sweep.xyz_m, seen, len(detected.index))
+    return PreparedSweep(sweep, _reduced(sweep, detected), detected.weight, lines, facts)
+
+
+def _reduced(sweep: LidarFrame, edges: SweepEdges) -> LidarFrame:
+    """The sweep reduced to some of its edges."""
+    offsets_s = None if sweep.time_offset_s is None else sweep.time_offset_s[edges.index]
     # The shift may come before motion compensation, which turns this tenth of a degree by two degrees at most.
-    xyz_m = sweep.xyz_m[detected.index] + detected.shift_m
-    edges = LidarFrame(sweep.stamp_ns, sweep.frame_id, xyz_m, time_offset_s=offsets_s)
-    return PreparedSweep(edges, detected.weight, sweep_facts(sweep.xyz_m, seen, len(detected.index)))
+    xyz_m = sweep.xyz_m[edges.index] + edges.shift_m
+    return LidarFrame(sweep.stamp_ns, sweep.frame_id, xyz_m, time_offset_s=offsets_s)
 
 
 def outline(camera: Camera, edges: Sequence[LidarFrame], pose: Matrix4, reach_rad: float) -> Rectangle | None:
@@ -246,9 +257,18 @@ CELL_STEP = 0.25
 """Difference step of the cells, in blurs of the finest band: half a pixel of the sharpest map."""
 
 
+RANGE, REFLECTANCE = 0, 1
+KINDS = 2
+"""Kinds of edges of a sweep."""
+
+KIND_COUNTS = np.array([1.0, 2.0])
+"""What an edge of each kind counts as. Neighbouring range edges lie along one silhouette, and fall on the same image
+edge or miss it together. See docs/measured.md."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ProjectedLevel:
-    """Range edges on the maps of one level, and the blur of these maps, an angle about the optical axis."""
+    """Edges of sweeps on the maps of one level, and the blur of these maps, an angle about the optical axis."""
 
     frames: alignment.EdgeFrames
     blur_rad: float
@@ -256,15 +276,20 @@ class ProjectedLevel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProjectedEdges:
-    """The range edges that can come into view, on maps of several levels: the same points in the same order on each.
+    """The edges of sweeps that can come into view, on maps of several levels: the same points in the same order on
+    each.
 
     Attributes:
+        kind: (E,) uint8 kind of each edge.
+        balance: (KINDS,) factors by which the weights of each kind were multiplied, the largest one 1.
         sharp: on the sharpest edges, which settle a pose.
         whole: on blurred edges that keep the layout of the scene.
         bands: from fine to coarse; at least two.
-        measured: the pairs, their sweeps reduced to these range edges, before motion compensation.
+        measured: the pairs, their sweeps reduced to these edges, before motion compensation.
     """
 
+    kind: NDArray[np.uint8]
+    balance: NDArray[np.float64]
     sharp: ProjectedLevel
     whole: ProjectedLevel
     bands: tuple[ProjectedLevel, ...]
@@ -272,18 +297,46 @@ class ProjectedEdges:
 
     @property
     def frame(self) -> NDArray[np.int64]:
-        """(E,) the frame of each range edge."""
+        """(E,) the frame of each edge."""
         first = self.sharp.frames.first_point
         return np.repeat(np.arange(len(first) - 1), np.diff(first))
 
     def of(self, indices: Sequence[int]) -> ProjectedEdges:
         """The edges of some of the pairs alone, by their indices."""
         return ProjectedEdges(
+            self.kind[_rows_of(self.sharp.frames, indices)],
+            self.balance,
             _level_of(self.sharp, indices),
             _level_of(self.whole, indices),
             tuple(_level_of(band, indices) for band in self.bands),
             tuple(self.measured[i] for i in indices),
         )
+
+    def weighted(self, factors: NDArray[np.float64]) -> ProjectedEdges:
+        """The edges with the weight of each multiplied by the factor of its kind, (KINDS,), the largest one 1."""
+        of_edges = factors.astype(np.float32)[self.kind]
+
+        def level(of: ProjectedLevel) -> ProjectedLevel:
+            return replace(of, frames=replace(of.frames, weight=of.frames.weight * of_edges))
+
+        balance = self.balance * factors
+        return replace(
+            self,
+            balance=balance / balance.max(),
+            sharp=level(self.sharp),
+            whole=level(self.whole),
+            bands=tuple(level(band) for band in self.bands),
+        )
+
+    def count(self, T_camera_lidar: Matrix4 | None = None) -> float:
+        """The effective number of edges (Kish 1965, by the weights of their kinds): of those in the images at a pose
+        (4, 4), or of all."""
+        kind, frames = self.kind, self.sharp.frames
+        if T_camera_lidar is not None:
+            uv_px, valid = project(frames.camera, placed(frames, T_camera_lidar))
+            kind = kind[valid & in_image(frames.camera, uv_px)]
+        numbers = np.bincount(kind, minlength=KINDS) * KIND_COUNTS
+        return float((numbers @ self.balance) ** 2 / max(float(numbers @ self.balance**2), 1e-9))
 
     def cells(self, T_camera_lidar: Matrix4) -> Cells:
         """The sharpest edges by sectors of the image, cut at a pose (4, 4)."""
@@ -314,9 +367,10 @@ def project_edges(
     reach_rad: float,
     *,
     compensated: bool,
+    with_reflectance: bool = False,
 ) -> ProjectedEdges:
-    """Lays the range edges that come within the prepared part of the images at a pose (4, 4), or within `reach_rad` of
-    it.
+    """Lays the edges of the sweeps that come within the prepared part of the images at a pose (4, 4), or within
+    `reach_rad` of it: those of range, and those of reflectance if they are wanted and the sweeps have it.
 
     Args:
         sweeps: those of the pairs, in order.
@@ -324,16 +378,23 @@ def project_edges(
         compensated: whether the sweeps are to be motion-compensated.
     """
     margin_px = reach_rad / images.sharp.blur_rad * _PIXELS_PER_BLUR
-    measured, points_m, weights = [], [], []
-    for pair, sweep in zip(pairs, sweeps, strict=True):
-        of_edges = replace(pair, lidar=sweep.edges)
+    measured, points_m, weights, kinds = [], [], [], []
+    detected = reflectance_edges_of(sweeps) if with_reflectance else [None] * len(sweeps)
+    for pair, sweep, more in zip(pairs, sweeps, detected, strict=True):
+        edges, weight, kind = sweep.edges, sweep.weight, np.full(len(sweep.weight), RANGE, np.uint8)
+        if more is not None:
+            edges = _joined(edges, _reduced(sweep.sweep, more))
+            weight = np.concatenate([weight, more.weight])
+            kind = np.concatenate([kind, np.full(len(more.weight), REFLECTANCE, np.uint8)])
+        of_edges = replace(pair, lidar=edges)
         xyz_m = compensate(of_edges, rig, enabled=compensated)
         near = np.flatnonzero(_may_be_seen(images.sharp, xyz_m, pose, margin_px))
-        offsets_s = None if sweep.edges.time_offset_s is None else sweep.edges.time_offset_s[near]
-        of_near = replace(sweep.edges, xyz_m=sweep.edges.xyz_m[near], time_offset_s=offsets_s)
+        offsets_s = None if edges.time_offset_s is None else edges.time_offset_s[near]
+        of_near = replace(edges, xyz_m=edges.xyz_m[near], time_offset_s=offsets_s)
         measured.append(replace(pair, lidar=of_near))
         points_m.append(xyz_m[near])
-        weights.append(sweep.weight[near])
+        weights.append(weight[near])
+        kinds.append(kind[near])
     first_point = np.concatenate([[0], np.cumsum([len(weight) for weight in weights])]).astype(np.int64)
     xyz_m, weight = np.ascontiguousarray(np.concatenate(points_m).T), np.concatenate(weights)
 
@@ -343,7 +404,35 @@ def project_edges(
         )
 
     bands = tuple(projected(band) for band in images.bands)
-    return ProjectedEdges(projected(images.sharp), projected(images.whole), bands, tuple(measured))
+    return ProjectedEdges(
+        np.concatenate(kinds),
+        (np.bincount(np.concatenate(kinds), minlength=KINDS) > 0).astype(np.float64),
+        projected(images.sharp),
+        projected(images.whole),
+        bands,
+        tuple(measured),
+    )
+
+
+def reflectance_edges_of(sweeps: Sequence[PreparedSweep]) -> list[SweepEdges | None]:
+    """The reflectance edges of each sweep of one LiDAR, against the noise that these sweeps show; None of a sweep
+    without reflectance, or of all if there are too few steps to learn its noise."""
+    steps = [
+        None if sweep.sweep.intensity is None else reflectance_steps(sweep.lines, sweep.sweep.intensity)
+        for sweep in sweeps
+    ]
+    noise = learn_noise([one for one in steps if one is not None])
+    return [None if one is None or noise is None else reflectance_edges(one, noise) for one in steps]
+
+
+def _joined(one: LidarFrame, other: LidarFrame) -> LidarFrame:
+    """The points of both."""
+    offsets_s = (
+        None
+        if one.time_offset_s is None or other.time_offset_s is None
+        else np.concatenate([one.time_offset_s, other.time_offset_s])
+    )
+    return replace(one, xyz_m=np.concatenate([one.xyz_m, other.xyz_m]), time_offset_s=offsets_s)
 
 
 _PIXELS_PER_BLUR = 2.0
@@ -364,9 +453,8 @@ def _may_be_seen(level: MapLevel, xyz_m: NDArray[np.float32], pose: Matrix4, mar
 
 
 def _level_of(level: ProjectedLevel, indices: Sequence[int]) -> ProjectedLevel:
-    frames = level.frames
+    frames, rows = level.frames, _rows_of(level.frames, indices)
     first = frames.first_point
-    rows = np.concatenate([np.arange(first[i], first[i + 1]) for i in indices])
     counts = [first[i + 1] - first[i] for i in indices]
     of_some = replace(
         frames,
@@ -376,6 +464,12 @@ def _level_of(level: ProjectedLevel, indices: Sequence[int]) -> ProjectedLevel:
         maps=np.ascontiguousarray(frames.maps[list(indices)]),
     )
     return replace(level, frames=of_some)
+
+
+def _rows_of(frames: alignment.EdgeFrames, indices: Sequence[int]) -> NDArray[np.int64]:
+    """The indices of the edges of some frames."""
+    first = frames.first_point
+    return np.concatenate([np.arange(first[i], first[i + 1]) for i in indices])
 
 
 REACH_RAD = radians(4.0)
@@ -401,6 +495,16 @@ OTHER_POSES, OTHER_POSES_RAD = 32, (radians(3.0), radians(28.0))
 """Number of poses either way, and the range of their turns about the LiDAR's axis, that give the mean and the standard
 deviation of a significance. After such turns range edges stay on the prepared strip of the image and in its layout:
 they lie as high as before, but on other things."""
+
+BALANCE_POSES = 16
+"""The same number for the weights of the kinds of edges."""
+
+LEAST_CONTRAST = 3.0
+"""Least contrast of a kind of edges that has any weight, standard deviations: of useless ones one in a thousand."""
+
+SELECTION = 2.0
+"""By how much the choice of weights raises the contrast where nothing fits, standard deviations. See
+docs/measured.md."""
 
 MIN_CONTRAST = 4.0
 """If an optimum stands out from other poses by fewer standard deviations, its edges count as faint, and no place other
@@ -438,11 +542,14 @@ class LocalOptima:
     """What was found near a pose.
 
     Attributes:
+        edges: those by which it was found, with the weights of their kinds.
         T_rotation: (4, 4) local optimum over rotations, with the camera's centre of the pose.
         T_pose: (4, 4) local optimum over all six degrees of freedom.
-        contrast: how far the finest band at `T_rotation` stands above other poses, standard deviations.
+        contrast: how far the finest band at `T_rotation` stands above other poses, standard deviations; less
+            `SELECTION` if weights were chosen.
     """
 
+    edges: ProjectedEdges
     T_rotation: Matrix4
     T_pose: Matrix4
     contrast: float
@@ -457,16 +564,54 @@ class _End:
 def search_local_optima(edges: ProjectedEdges, pose: Matrix4) -> LocalOptima:
     """The neighbourhood of a pose (4, 4)."""
     pose = np.ascontiguousarray(pose)
-    coarsest, finest, sharp = edges.bands[-1], edges.bands[0], edges.sharp
-    settled = se3.axis_steps(finest.blur_rad, POLISH_METRES_PER_RADIAN)
-    near = _ascend(sharp.frames, pose, settled[:ROTATION_DOF], TOLERANCE)
+    step = se3.axis_steps(edges.bands[0].blur_rad, POLISH_METRES_PER_RADIAN)[:ROTATION_DOF]
+    near = _ascend(edges.sharp.frames, pose, step, TOLERANCE)
+    return _best_of(edges, near, _ends(edges, pose, near, step), step)
+
+
+def search_with_reflectance(edges: ProjectedEdges, pose: Matrix4, of_range: Matrix4) -> LocalOptima | None:
+    """The same with both kinds of edges, each with the weight that it is worth here; None if reflectance edges are
+    worth nothing, and so change nothing. `of_range` (4, 4) is the optimum of range edges."""
+    if not (edges.kind == REFLECTANCE).any():
+        return None
+    pose = np.ascontiguousarray(pose)
+    step = se3.axis_steps(edges.bands[0].blur_rad, POLISH_METRES_PER_RADIAN)[:ROTATION_DOF]
+    edges = _balanced_by_power(edges)
+    near = _ascend(edges.sharp.frames, pose, step, TOLERANCE)
+    ends = _ends(edges, pose, near, step)
+    # What each kind is worth shows where they fit best.
+    edges = _balanced(edges, [near.pose, *(end.pose for end in ends), of_range])
+    if edges.balance[REFLECTANCE] == 0.0:
+        return None
+    best = _best_of(edges, _ascend(edges.sharp.frames, near.pose, step, TOLERANCE), ends, step)
+    return replace(best, contrast=best.contrast - SELECTION)
+
+
+def _best_of(edges: ProjectedEdges, near: _End, ends: Sequence[_End], step: NDArray[np.float64]) -> LocalOptima:
+    """The optima at the maximum next to a pose, or where one of some climbs leads if that is clearly better."""
+    finest = edges.bands[0]
     fair = HOPELESS_SHARE * float(alignment.smooth_significances(finest.frames, near.pose[None])[0])
+    best = near
+    for end in ends:
+        z = float(alignment.smooth_significances(finest.frames, end.pose[None])[0])
+        if z >= fair and _angle_between(end.pose, near.pose) >= SAME * finest.blur_rad:
+            end = _ascend(edges.sharp.frames, end.pose, step, TOLERANCE)
+            best = max(best, end, key=lambda one: one.significance)
+    there = _contrast(finest, best.pose)
+    if best is not near and (there < MIN_CONTRAST or near.significance >= NEAR_SHARE * best.significance):
+        best, there = near, _contrast(finest, near.pose)
+    return LocalOptima(edges, best.pose, _pose_of(edges, best), there)
+
+
+def _ends(edges: ProjectedEdges, pose: Matrix4, near: _End, step: NDArray[np.float64]) -> list[_End]:
+    """The ends of climbs on the bands, from the maximum next to a pose and from other hills within reach."""
+    coarsest, finest = edges.bands[-1], edges.bands[0]
     cover = _cover(pose, coarsest.blur_rad)
     thin = coarsest.frames.of_points(thinned(len(coarsest.frames.weight), COVER_POINTS))
     z = alignment.significances(thin, cover)
     z_best = float(z.max())
     # The maximum of the sharpest edges next to the pose may be a ripple on a hill that is whole on the finest band.
-    ends = [_ascend(finest.frames, near.pose, settled[:ROTATION_DOF], LEADING_TOLERANCE)]
+    ends = [_ascend(finest.frames, near.pose, step, LEADING_TOLERANCE)]
     separation = MIN_SEPARATION * coarsest.blur_rad
     z_near = float(alignment.significances(thin, near.pose[None])[0])
     for number in select_separated(cover, np.argsort(-z, kind="stable"), BEGINNINGS, _trace_of(separation)):
@@ -476,27 +621,52 @@ def search_local_optima(edges: ProjectedEdges, pose: Matrix4) -> LocalOptima:
             _angle_between(cover[number], near.pose) > separation or z[number] > z_near
         ):
             ends.append(_led(edges.bands, cover[number]))
-    best = near
-    for end in ends:
-        if end.significance >= fair and _angle_between(end.pose, near.pose) >= SAME * finest.blur_rad:
-            end = _ascend(sharp.frames, end.pose, settled[:ROTATION_DOF], TOLERANCE)
-            best = max(best, end, key=lambda one: one.significance)
-    there = _contrast(finest, best.pose)
-    if best is not near and (there < MIN_CONTRAST or near.significance >= NEAR_SHARE * best.significance):
-        best, there = near, _contrast(finest, near.pose)
-    return LocalOptima(best.pose, _pose_of(edges, best), there)
+    return ends
+
+
+def _balanced_by_power(edges: ProjectedEdges) -> ProjectedEdges:
+    """The edges with the weights of the more numerous kind reduced until the squares of both add to the same: if one of
+    them fits nothing at all, the significance of the true pose falls by a root of two."""
+    square = np.bincount(edges.kind, edges.sharp.frames.weight.astype(np.float64) ** 2, KINDS)
+    return edges.weighted(np.sqrt(max(square.min(), 1e-9) / np.maximum(square, 1e-9)))
+
+
+def _balanced(edges: ProjectedEdges, poses: Sequence[Matrix4]) -> ProjectedEdges:
+    """The edges with the weights by which one of some poses stands out most from other poses: each kind in proportion
+    to how far it stands out by itself, in units of its variance (linear discriminant, Fisher 1936). A kind that stands
+    out by less than `LEAST_CONTRAST` standard deviations weighs nothing."""
+    band = edges.bands[0].frames
+    kinds = [band.of_points(np.flatnonzero(edges.kind == kind)) for kind in range(KINDS)]
+    nothing = np.array([1.0, 0.0])
+    best, balance = 0.0, nothing
+    for pose in poses:
+        there = np.concatenate([pose[None], pose @ _other_turns(BALANCE_POSES)])
+        sums = np.stack([alignment.alignments(of_kind, there).strength.sum(axis=1) for of_kind in kinds])
+        excess = sums[:, 0] - sums[:, 1:].mean(axis=1)
+        variance = np.maximum(sums[:, 1:].var(axis=1), 1e-9)
+        contrast = excess / np.sqrt(variance)
+        evidence = float((np.maximum(contrast, 0.0) ** 2).sum())
+        if evidence > best:
+            gain = np.where(contrast >= LEAST_CONTRAST, excess / variance, 0.0)
+            best, balance = evidence, gain / gain.max() if gain.any() else nothing
+    return edges.weighted(balance)
+
+
+def _other_turns(each_way: int) -> NDArray[np.float64]:
+    """(2·each_way, 4, 4) turns about the LiDAR's axis, after which the same sweeps lie on other parts of the images."""
+    turns = np.tile(np.eye(4), (2 * each_way, 1, 1))
+    one_way = np.linspace(*OTHER_POSES_RAD, each_way)
+    angle_rad = np.concatenate([one_way, -one_way])
+    turns[:, 0, 0] = turns[:, 1, 1] = np.cos(angle_rad)
+    turns[:, 1, 0] = np.sin(angle_rad)
+    turns[:, 0, 1] = -turns[:, 1, 0]
+    return turns
 
 
 def _contrast(band: ProjectedLevel, pose: Matrix4) -> float:
     """How far a pose stands above others at which the same sweeps lie on other parts of the images; standard
     deviations."""
-    turned = np.tile(np.eye(4), (2 * OTHER_POSES, 1, 1))
-    one_way = np.linspace(*OTHER_POSES_RAD, OTHER_POSES)
-    angle_rad = np.concatenate([one_way, -one_way])
-    turned[:, 0, 0] = turned[:, 1, 1] = np.cos(angle_rad)
-    turned[:, 1, 0] = np.sin(angle_rad)
-    turned[:, 0, 1] = -turned[:, 1, 0]
-    z = alignment.significances(band.frames, np.concatenate([pose[None], pose @ turned]))
+    z = alignment.significances(band.frames, np.concatenate([pose[None], pose @ _other_turns(OTHER_POSES)]))
     return float((z[0] - z[1:].mean()) / max(float(z[1:].std()), 1e-9))
 
 

@@ -44,6 +44,8 @@ from coec.calibration.monitor.change_detector import Observation
 from coec.calibration.monitor.check import (
     AT_POSE,
     CERTAIN,
+    MIN_EDGES_IN_VIEW,
+    MIN_INDEPENDENT_SAMPLES,
     Check,
     CheckInput,
     DepthCue,
@@ -198,16 +200,6 @@ degree is then only two standard deviations. See docs/measured.md."""
 LOST_SHARE = 0.5
 """Share of the significance at the optimum: if the expected pose has less, scatter explains that in no scene."""
 
-MIN_EDGES_IN_VIEW = 150.0
-"""With fewer range edges in view per pair a check's edges count as faint, however well they fit: a guard rail and a
-lane marking then decide, the same in every pair. See docs/measured.md."""
-
-MIN_INDEPENDENT_SAMPLES = 2.0
-"""If the pairs of a moving vehicle are worth fewer independent samples, the edges of a check count as faint. Frames
-that say the same although the vehicle has moved on, as between the guard rails of a highway, are all wrong if one is,
-and so is the next check. See docs/measured.md."""
-
-
 MOST_SCATTER = 5.0
 """Pairs of a check that scatter by more than this many times what they should, on an axis of rotation, do not show one
 pose, as while the mount swings. See docs/measured.md."""
@@ -318,18 +310,21 @@ def judge_check(evidence: CheckInput, seen: Check, pose: Matrix4, baseline: Base
     dirty, textured = (
         ((), 0) if baseline is None or causes else sensor_faults.dirty_blocks(evidence.scenes, baseline.scene)
     )
-    if not causes and not faint & {Faint.EDGES_IN_VIEW, Faint.INDEPENDENT_SAMPLES}:
+    # Traffic alongside has reflectance edges, too, and fits a vehicle that stands: range edges alone explain.
+    by_range = seen if seen.by_range is None else seen.by_range
+    faint_range = faintness(evidence.pairs, by_range, limits)
+    if not causes and not faint_range & {Faint.EDGES_IN_VIEW, Faint.INDEPENDENT_SAMPLES}:
         # Few edges fit another clock as well as they fit another mount.
         explained = explained_by_nuisance(
             evidence.edges.measured,
             evidence.rig,
             evidence.edges.whole.frames,
             se3.perturb(pose, rotation.expected),
-            seen.T_rotation,
-            seen.T_pose,
+            by_range.T_rotation,
+            by_range.T_pose,
             limits.min_edges_per_pair * float(np.sqrt(seen.pairs)),
             # Edges that stand out nowhere fit some other focal length by chance.
-            () if Faint.CONTRAST in faint else ZOOMS,
+            () if Faint.CONTRAST in faint_range else ZOOMS,
         )
         causes = () if explained is None else (explained,)
     stamps_ns = tuple(pair.stamp_ns for pair in evidence.pairs)
