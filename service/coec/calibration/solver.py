@@ -258,7 +258,7 @@ def by_fusion(data: WindowData, config: CalibrationConfig) -> EstimatorResult:
     fusion = Fusion(edges, depth, start, reach)
     basins = basins_of_each_kind(fusion)
     data.progress.step("basins", 1, 1)
-    ranked = rank_basins(fusion, basins)
+    ranked = rank_basins(fusion, basins, window.start_known_to_rad)
     polished = polish_basins(fusion, ranked, config.search, data.progress)
     summits = choose_basin(fusion, polished, window)
     edges = edges.balanced_at(summits[0])
@@ -326,9 +326,10 @@ def _has_one_that_stands_alone(fusion: Fusion, poses: Sequence[Matrix4]) -> bool
     return bool(of_kinds[:, best].min() >= CLEAR and contrast[far].max(initial=0.0) <= STANDING_ALONE * contrast[best])
 
 
-def rank_basins(fusion: Fusion, basins: Sequence[Matrix4]) -> RankedBasins:
-    """The basins (4, 4) by both cues, and whether the neighbourhood of the start compares with them. It is polished
-    wherever the charts rank it."""
+def rank_basins(fusion: Fusion, basins: Sequence[Matrix4], start_known_to_rad: float) -> RankedBasins:
+    """The basins (4, 4) by both cues, and whether the neighbourhood of the start, which is known to some angle,
+    compares with them. It is polished wherever the charts rank it, and if no basin could outweigh the prior of the
+    start."""
     ranked = sorted(_with_ranks(fusion, basins), key=lambda basin: -basin.rank)
     least = PLAUSIBLE * max((basin.rank for basin in ranked), default=0.0)
     plausible = tuple(basin.T_camera_lidar for basin in ranked[:POLISHED_BASINS] if basin.rank >= least)
@@ -336,7 +337,11 @@ def rank_basins(fusion: Fusion, basins: Sequence[Matrix4]) -> RankedBasins:
     of_start = basin_next_to(
         fusion.edges, fusion.start, mutual_information.SearchBox(NEIGHBOURHOOD_RAD, fusion.reach.translation_m)
     )
-    if fusion.rank(of_start) >= least:
+    outweighed = any(
+        log_prior(basin.T_camera_lidar, fusion.start, start_known_to_rad) + 0.5 * basin.rank**2 > 0.0
+        for basin in ranked[: len(plausible)]
+    )
+    if fusion.rank(of_start) >= least or not outweighed:
         return RankedBasins(plausible, implausible, start_is_plausible=True)
     return RankedBasins(plausible, (*implausible, of_start), start_is_plausible=False)
 

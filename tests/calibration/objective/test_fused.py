@@ -85,7 +85,7 @@ def fusion(sharp_street: Window, sharp_edges: EdgeCue, depth_cue: MutualInformat
 
 @pytest.fixture(scope="module")
 def fused(fusion: Fusion) -> FusedObjective:
-    return fusion.settling[0]
+    return fusion.settling(fusion.edges)[0]
 
 
 def solve(window: Window, depth: DepthModel, config: CalibrationConfig = FUSED) -> Estimate:
@@ -129,7 +129,7 @@ def test_the_score_is_the_sum_of_both_cues_in_their_own_standard_deviations(
     others = sample_reach(sharp_street.T_camera_lidar_start, REACH, OTHER_POSES)
     other_mi = np.array([depth_cue.evaluate(other).score for other in others])
     of_depth = (depth_cue.evaluate(pose).score - other_mi.mean()) / other_mi.std()
-    for objective, edges in zip(fusion.settling, (sharp_edges.whole, sharp_edges.sharp), strict=True):
+    for objective, edges in zip(fusion.settling(sharp_edges), (sharp_edges.whole, sharp_edges.sharp), strict=True):
         z = significances(edges, others)
         expected = (z_of(edges, pose) - z.mean()) / z.std() + of_depth
         assert objective.evaluate(pose).score == pytest.approx(expected, abs=1e-6)
@@ -143,7 +143,7 @@ def test_basins_are_ranked_from_coarse_to_fine_and_settled_on_the_sharpest_edges
     sharp_edges: EdgeCue, fusion: Fusion
 ) -> None:
     assert [objective.step_rad for objective in fusion.ranking] == [*reversed(sharp_edges.band_blur_rad[:-1])]
-    whole, sharp = fusion.settling
+    whole, sharp = fusion.settling(fusion.edges)
     assert sharp.step_rad == whole.step_rad == sharp_edges.blur_rad <= fusion.ranking[-1].step_rad
 
 
@@ -206,7 +206,7 @@ def test_depth_that_does_not_vary_with_the_pose_leaves_the_edges_to_decide(
             return DepthMap(np.ones((40, 40), np.float32))
 
     blank, start = mutual_information_of(sharp_street, Blank()), sharp_street.T_camera_lidar_start
-    alone = Fusion(sharp_edges, blank, start, REACH).settling[0]
+    alone = Fusion(sharp_edges, blank, start, REACH).settling(sharp_edges)[0]
     score = alone.evaluate(sharp_street.T_camera_lidar_start).score
     assert np.isfinite(score)
     assert score > alone.evaluate(from_start(sharp_street, 4, 3.0).T_camera_lidar_start).score

@@ -164,7 +164,9 @@ def test_a_pose_from_the_frame_of_the_cloud_is_named(street: Window) -> None:
     assert mistake.T_camera_lidar == pytest.approx(right, abs=1e-9)
 
 
-def test_clouds_that_are_compensated_already_are_named(street: Window) -> None:
+def test_clouds_that_are_compensated_already_are_named() -> None:
+    # At a lower speed a slightly longer focal length explains nearly as much.
+    street = window_of(rendered_source(f"{STREET}&speed_mps=14"))
     still = tuple(
         replace(pair, lidar=replace(pair.lidar, xyz_m=compensate(pair, street.rig, enabled=True)))
         for pair in street.pairs

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.objective.edges import EdgeCue
-from coec.calibration.search.global_search import COARSE, FINE, separated, shifted
+from coec.calibration.search.global_search import COARSE, FINE, TURNED_FOR, separated, shifted
 from coec.geometry import se3
 from coec.geometry.cameras import in_image
 from coec.geometry.edges.alignment import EdgeFrames
@@ -107,9 +107,8 @@ def find_free_basins(edges: EdgeCue, place_m: NDArray[np.float64], *, turns_only
         poses, z = pattern_search(charts, poses[best], steps, number.halvings, centre, reach)
         for shift_m in () if turns_only or number.chart == COARSE else SHIFTS_M:
             best = separated(poses, z, SHIFTED.poses, SHIFTED.separation_rad)
-            more, _ = pattern_search(
-                charts.at_most(SHIFTED.points), shifted(poses[best], shift_m), steps, number.halvings, centre, reach
-            )
+            moved = shifted(poses[best], shift_m, TURNED_FOR * se3.METRES_PER_RADIAN)
+            more, _ = pattern_search(charts.at_most(SHIFTED.points), moved, steps, number.halvings, centre, reach)
             poses = np.concatenate([poses, more])
             z = charted_significances(charts, poses)
     best = separated(poses, z, ROUNDS[-1].poses, ROUNDS[-1].separation_rad)

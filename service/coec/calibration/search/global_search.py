@@ -24,6 +24,7 @@ from coec.geometry.edges.charts import (
     select_separated,
     unit_ball,
 )
+from coec.geometry.points import lengths
 
 COVER_RAD = radians(0.9)
 """Distance between the poses of the cover: less than the blur of the coarsest level on common lenses."""
@@ -75,17 +76,26 @@ ROUNDS = (
 its own chart, which is how the true pose is found: on a coarse chart hundreds of layouts that happen to fit may rank
 above it. See docs/measured.md."""
 
-SHIFTED_POSES, SHIFT_M = 6, 0.25
-"""If translation is searched, each of this many best poses is shifted by this distance either way along each axis, and
-the shifted poses climb again. This is needed because poses of one rotation do not count as apart, so their translation
-was chosen on the coarse chart, which hardly shows it. See docs/measured.md."""
+SHIFTED_POSES, SHIFT_RAD = 6, radians(2.0)
+"""If translation is searched, each of this many best poses is shifted either way along each axis by this angle as seen
+from the nearest edges, and the shifted poses climb again. This is needed because poses of one rotation do not count as
+apart, so their translation was chosen on the coarse chart, which hardly shows it. See docs/measured.md."""
 
-SHIFT_TURNS = 2
-"""How often that is done, each time with the best poses so far: the translation of the cover may be two shifts off."""
+SHIFT_TURNS, SHIFT_SPAN_M = 2, 0.5
+"""How often that is done at least, each time with the best poses so far; and how far it leads at least: the translation
+of the cover may be that far off, which in a room is many shifts."""
 
-TURNED_FOR_M = 10.0
-"""A shift to the side or upwards is also tried with the turn that leaves things at this distance where they are in the
-image. Along this valley turns and shifts make up for each other, and a climb along single axes halts in it."""
+TURNED_FOR = 1.4
+"""A shift to the side or upwards is also tried with the turn that leaves things at this multiple of the distance of the
+nearest edges where they are in the image. Along this valley turns and shifts make up for each other, and a climb along
+single axes halts in it."""
+
+NEAREST_PERCENT = 25
+"""This percentile of the ranges of the edges is the distance of the nearest ones. It is seven metres in streets
+(`se3.METRES_PER_RADIAN`) and counts as no more."""
+
+LEAST_NEAR_M = 1.0
+"""The least such distance: bounds the number of shifts."""
 
 SHIFTED = _Round(10 * SHIFTED_POSES, 0.0, FINE, thinned=False, points=4_000, step_rad=radians(0.15), halvings=1)
 """How the shifted poses climb: as in the last round, with as many edges as it takes to see a quarter of a metre."""
@@ -124,9 +134,12 @@ def find_basins(edges: EdgeCue, start: Matrix4, reach: SearchBox) -> list[Basin]
         charts = thinned_to[number.chart] if number.thinned else finest
         poses = poses[separated(poses, charted_significances(charts, poses), number.poses, number.separation_rad)]
         poses, z = _pattern_searched(charts, poses, number, start, reach)
-    for _ in range(SHIFT_TURNS if reach.translation_m > 0.0 else 0):
+    near_m = _near_m(finest)
+    shift_m = near_m * SHIFT_RAD
+    turns = max(SHIFT_TURNS, round(SHIFT_SPAN_M / shift_m)) if reach.translation_m > 0.0 else 0
+    for _ in range(turns):
         best = separated(poses, z, SHIFTED_POSES, ROUNDS[-1].separation_rad)
-        moved = _within(shifted(poses[best], SHIFT_M), start, reach)
+        moved = _within(shifted(poses[best], shift_m, TURNED_FOR * near_m), start, reach)
         more, _ = _pattern_searched(finest, moved, SHIFTED, start, reach)
         poses, z = np.concatenate([poses, more]), np.concatenate([z, charted_significances(finest, more)])
     z = charted_significances(finest, poses)
@@ -180,10 +193,15 @@ def _promising(charts: EdgeCharts, start: Matrix4, reach: SearchBox) -> NDArray[
     return poses[separated(poses, z, ROUNDS[0].poses, ROUNDS[0].separation_rad)]
 
 
-def shifted(poses: NDArray[np.float64], shift_m: float) -> NDArray[np.float64]:
+def _near_m(charts: EdgeCharts) -> float:
+    nearest_m = float(np.percentile(lengths(charts.xyz_m.T), NEAREST_PERCENT)) if len(charts.weight) else np.inf
+    return min(max(nearest_m, LEAST_NEAR_M), se3.METRES_PER_RADIAN)
+
+
+def shifted(poses: NDArray[np.float64], shift_m: float, turned_for_m: float) -> NDArray[np.float64]:
     """(10·K, 4, 4) the poses (K, 4, 4), each shifted either way along each camera axis, and sideways and upwards also
     with the turn that makes up for it."""
-    turn_rad = shift_m / TURNED_FOR_M
+    turn_rad = shift_m / turned_for_m
     x, y, z = shift_m * np.eye(6)[3:]
     one_way = np.array([x, x - turn_rad * np.eye(6)[1], y, y + turn_rad * np.eye(6)[0], z])
     return np.array([se3.perturb(pose, step) for pose in poses for step in (*one_way, *-one_way)])
@@ -198,7 +216,7 @@ def _within(poses: NDArray[np.float64], start: Matrix4, reach: SearchBox) -> NDA
 def _pattern_searched(
     charts: EdgeCharts, poses: NDArray[np.float64], number: _Round, start: Matrix4, reach: SearchBox
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    steps = se3.axis_steps(number.step_rad)
+    steps = se3.axis_steps(number.step_rad, _near_m(charts))
     if reach.translation_m == 0.0:
         steps[3:] = 0.0
     few = charts.at_most(number.points)
