@@ -106,6 +106,22 @@ def test_the_true_translation_is_detected_from_half_a_metre_away(sample_data: Pa
         assert np.linalg.norm(best[:3, 3] - truth[:3, 3]) < 0.2
 
 
+def test_in_a_room_every_start_leads_to_one_basin(sample_data: Path) -> None:
+    """A quarter of the edges of this laboratory are nearer than three metres."""
+    window = window_of(open_source(str(sample_data / "fisheye_lab_vlp16/dataset.yaml")))
+    greys = (GreyImages(LimitsConfig()).grey(pair.camera) for pair in window.pairs)
+    edges = build_edges(window.pairs, lambda index, points: window.pairs[index].lidar.xyz_m[points], greys, window.rig)
+    truth, best = window.T_camera_lidar_start, []
+    for seed in range(2):
+        turn, shift = np.random.default_rng([seed, 2]).normal(size=(2, 3))
+        start = se3.perturb(truth, np.array([*np.radians(15.0) * turn / np.linalg.norm(turn), 0.0, 0.0, 0.0]))
+        start[:3, 3] += 0.35 * shift / np.linalg.norm(shift)
+        best.append(find_basins(edges, start, BOTH)[0].T_camera_lidar)
+    difference = se3.difference(best[1], best[0])
+    assert np.degrees(np.linalg.norm(difference[:3])) < 0.6
+    assert np.linalg.norm(difference[3:]) < 0.02
+
+
 def test_basins_are_distinct_and_the_best_comes_first(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     basins = find_basins(sharp_edges, away_from(sharp_street.rig.T_camera_lidar_nominal, 10.0, 4), TURN)
     assert 1 <= len(basins) <= ROUNDS[-1].poses
