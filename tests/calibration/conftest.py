@@ -50,7 +50,7 @@ def sharp_street() -> Window:
 
 @pytest.fixture(scope="session")
 def sharp_edges(sharp_street: Window) -> EdgeCue:
-    """The edge witness of the sharp street."""
+    """The edge cue of the sharp street."""
     rig, pairs, images = sharp_street.rig, sharp_street.pairs, GreyImages(LimitsConfig())
     return build_edges(
         pairs,

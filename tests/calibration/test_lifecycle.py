@@ -361,7 +361,7 @@ def test_a_window_elsewhere_and_a_monitor_that_suspects_are_two_cues() -> None:
     assert before_estimate(suspect, near, begin_ns, RULES) is suspect
     assert before_estimate(suspect, moved, begin_ns - 1, RULES) is suspect, "it mixes two mounts"
     assert before_estimate(suspect, estimate(2.0, 200, Decision.FAILED), begin_ns, RULES) is suspect
-    assert before_estimate(HEALTHY, moved, begin_ns, RULES) is HEALTHY, "one witness"
+    assert before_estimate(HEALTHY, moved, begin_ns, RULES) is HEALTHY, "one source"
 
 
 def test_where_no_check_was_ever_clear_the_first_window_counts_in_full() -> None:

@@ -191,7 +191,7 @@ class MonitorLimits:
             farthest off, likewise.
         min_edges_per_pair: significance of the edges at the local optimum, over the root of the number of pairs.
         insisted_share: share of these two distance limits beyond which an optimum is too far off if the edges insist.
-        max_agreement_rad: angle between the local optima of the two witnesses.
+        max_agreement_rad: angle between the local optima of the two cues.
         min_overlap: points in view over the most that any pose within reach sees.
         min_mi, max_f1, min_f2: equation (2) of Borer et al. 2023: nats, per radian, per radian².
     """

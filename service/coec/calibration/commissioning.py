@@ -194,7 +194,7 @@ NEAREST_SHARE = 0.25
 """A limit may be at most this share of the squared distance of the nearest moved check, which is half its distance."""
 
 AGREEMENT_RAD = radians(0.5)
-"""Least limit of the angle between the witnesses: a quarter of the hill of the depth witness."""
+"""Least limit of the angle between the cues: a quarter of the hill of the depth cue."""
 
 
 def commission(

@@ -100,7 +100,7 @@ SETTLED_POSES = 2
 it astray. See docs/measured.md."""
 
 LEADING_DEPTH_POINTS = 150_000
-"""Points of the window's clouds, in view or not, that the depth witness of a fusion uses until its basin is known. Few
+"""Points of the window's clouds, in view or not, that the depth cue of a fusion uses until its basin is known. Few
 are enough because its hill is degrees wide."""
 
 SEEN_DEPTH_POINTS = 100_000
@@ -109,7 +109,7 @@ histogram scatter by their square root; that scatter in a thousand cells puts ri
 near the edges alone do not hold its top. See docs/measured.md."""
 
 TELLING = 2.0
-"""More points are spent on the depth witness only if it stands out by at least this many standard deviations. Below
+"""More points are spent on the depth cue only if it stands out by at least this many standard deviations. Below
 that its peak may be chance, and more points would not change that."""
 
 SETTLING = mutual_information.SearchBox(radians(8.0), 0.5)
@@ -514,7 +514,7 @@ def _number(count: int, share: float) -> int:
 def _denser(
     data: WindowData, depth: mutual_information.MutualInformation, pose: Matrix4, config: CalibrationConfig
 ) -> mutual_information.MutualInformation:
-    """The depth witness with about `SEEN_DEPTH_POINTS` in view at `pose` (4, 4); unchanged if at least half as many are
+    """The depth cue with about `SEEN_DEPTH_POINTS` in view at `pose` (4, 4); unchanged if at least half as many are
     in view there already. At least one point must be in view there."""
     seen = depth.evaluate(pose).points_in_view
     if 2 * seen >= SEEN_DEPTH_POINTS:

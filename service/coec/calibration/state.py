@@ -226,7 +226,7 @@ def happened(state: PairState, event: HealthEvent, *reasons: Reason) -> PairStat
 
 def before_estimate(state: PairState, estimate: Estimate, window_start_ns: int, rules: PairRules) -> PairState:
     """The state when a window was solved, before `after_estimate`. If the window is accepted and its pose is elsewhere
-    than an extrinsic that the monitor suspects, there are two witnesses: the mount has moved, even if the next step
+    than an extrinsic that the monitor suspects, two sources agree: the mount has moved, even if the next step
     corrects it at once."""
     mixed = state.flagged_since_ns is not None and window_start_ns < state.flagged_since_ns
     if estimate.verdict.decision is Decision.FAILED or mixed or not _accused_elsewhere(state, estimate, rules):
@@ -337,7 +337,7 @@ def after_failure(state: PairState, reason: Reason) -> PairState:
 
 def _tracked(state: PairState, estimate: Estimate, rules: PairRules) -> Track:
     """The track with the estimate in it. It starts anew from the estimate if there is no track yet, or if the monitor
-    already accuses the served extrinsic and the estimate is elsewhere: then two witnesses agree that the mount
+    already accuses the served extrinsic and the estimate is elsewhere: then two sources agree that the mount
     moved."""
     measurement = Measurement.from_estimate(estimate)
     pose = estimate.optimum.T_camera_lidar

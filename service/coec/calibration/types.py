@@ -417,7 +417,7 @@ class Uncertainty:
         noise: (6, 6) covariance of the errors that differ from window to window; NaN on axes that were not determined.
         systematic: by the name of each error that windows have in common, (6,) the shift of the pose by one standard
             deviation of it.
-        looks: how many independent looks the frames of the window are worth; NaN if unknown.
+        independent_samples: how many independent frames those of the window count for; NaN if unknown.
     """
 
     noise: NDArray[np.float64]
@@ -612,7 +612,7 @@ class DepthModel(Protocol):
 
 
 class ImageReader(Protocol):
-    """Pixels of an exposure, for the witnesses that use the image itself."""
+    """Pixels of an exposure, for the cues that use the image itself."""
 
     def grey(self, frame: CameraFrame) -> NDArray[np.uint8]:
         """(height, width) grey values.

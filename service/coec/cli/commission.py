@@ -204,7 +204,7 @@ def _show_limits(baseline: Baseline) -> None:
         ("distance² over rotations, σ², at most", monitor.max_distance2_rotation),
         ("distance² of the farthest axis, σ², at most", monitor.max_farthest2_pose),
         ("edges per pair, at least", monitor.min_edges_per_pair),
-        ("agreement of the witnesses, deg, at most", float(np.degrees(monitor.max_agreement_rad))),
+        ("agreement of the cues, deg, at most", float(np.degrees(monitor.max_agreement_rad))),
         ("overlap, at least", monitor.min_overlap),
     ):
         limits.add_row(name, console.figure(value))

@@ -38,7 +38,7 @@ GOOD_RANK, GOOD_BIAS_RAD = 0.85, HIT_RAD
 on KITTI-360 has 0.90 and 0.2 degrees, a network trained on such views 0.91 and 0.4."""
 
 USABLE_RANK, USABLE_BIAS_RAD = 0.4, radians(6.0)
-"""Within these limits, the peak of the depth witness still holds the true pose (its half-width is 3 to 9 degrees). Of
+"""Within these limits, the peak of the depth cue still holds the true pose (its half-width is 3 to 9 degrees). Of
 five recordings and three networks, those beyond had a rank of 0.2 or less in a garage, or a bias of 11 degrees on a
 lens that they do not know.
 

@@ -19,7 +19,7 @@ from coec_lab.experiments.solve_experiments import SUBSETS, Bench
 from coec_lab.experiments.solve_statistics import FrameCountStatistics, NormalisedErrors, SliceStatistics, SolveOutcome
 
 LANDSCAPE = (
-    "The objective and its witnesses along each axis about the reference, from their lowest to their highest value: a "
+    "The objective and its cues along each axis about the reference, from their lowest to their highest value: a "
     "good one has one peak, at zero."
 )
 
@@ -108,7 +108,7 @@ def write_normalised(folder: Path, name: str, errors: Mapping[str, NormalisedErr
 def write_landscape(
     folder: Path, bench: Bench, title: str, on_progress: Callable[[int, str], None]
 ) -> Mapping[str, objective_scans.Views]:
-    """Writes profiles.png, the fused objective and its witnesses about the reference, and returns what it shows."""
+    """Writes profiles.png, the fused objective and its cues about the reference, and returns what it shows."""
     window = replace(bench.window, T_camera_lidar_start=bench.reference)
     window_data = prepare_window_data(window, bench.depth, bench.images, bench.configuration, Silence())
     named = objective_scans.landscapes(window_data, bench.configuration)

@@ -79,7 +79,7 @@ class ObjectiveLandscape:
 
 
 def landscapes(window_data: WindowData, config: CalibrationConfig) -> dict[str, ScoreFunction]:
-    """The objectives on a window, by name: the fused one, its two witnesses alone (`mi` is also the paper's objective),
+    """The objectives on a window, by name: the fused one, its two cues alone (`mi` is also the paper's objective),
     and the configured one if it is another.
 
     Raises:

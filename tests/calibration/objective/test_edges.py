@@ -1,4 +1,4 @@
-"""The edge witness of a window: its levels, whatever the camera, and its points."""
+"""The edge cue of a window: its levels, whatever the camera, and its points."""
 
 from collections.abc import Callable
 from dataclasses import replace

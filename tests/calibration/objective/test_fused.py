@@ -1,4 +1,4 @@
-"""Two witnesses in one objective, and the calibration that rests on it, on a street with a known truth."""
+"""Two cues in one objective, and the calibration that rests on it, on a street with a known truth."""
 
 from collections.abc import Callable
 from dataclasses import replace

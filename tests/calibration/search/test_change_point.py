@@ -16,7 +16,7 @@ LIMITS = VerdictConfig()
 
 
 def turned(edges: EdgeCue, first: int, last: int, T_before: Matrix4, T_after: Matrix4) -> EdgeCue:
-    """The witness as if the mount had been at `T_after` in the frames `first` to before `last`."""
+    """The cue as if the mount had been at `T_after` in the frames `first` to before `last`."""
     carried = se3.inverse(T_after) @ T_before
     band, chart, sharp = edges.bands[0], edges.charts[-1], edges.sharp
 

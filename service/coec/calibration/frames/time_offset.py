@@ -4,7 +4,7 @@ An offset dt moves every sweep by the ego-motion during dt: in a turn at the rat
 frame cannot tell that from a bent mount, but frames of different turn rates can, because the mount is the part that
 stays the same (cf. Rehder, Siegwart, Furgale, "A general approach to spatiotemporal calibration in multisensor
 systems", 2016: the offset is one more parameter of the estimate). So rotation and offset are fitted together, to the
-edge witness.
+edge cue.
 
 In straight driving at a steady speed, dt looks like a shift of the mount along the road, which no other frame
 contradicts. Therefore the uncertainty of the mount's position is carried into that of the offset, and a straight drive

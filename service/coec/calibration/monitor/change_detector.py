@@ -90,7 +90,7 @@ class MonitorOutcome(StrEnum):
 
 
 ACCUSING = frozenset({MonitorOutcome.SUSPECT, MonitorOutcome.CONFIRMED, MonitorOutcome.AT_ODDS})
-"""Findings because of which a window is wanted soon, and a window that finds another pose is a second witness. A mount
+"""Outcomes after which a window is requested soon: a window that finds another pose is independent evidence. A mount
 that moved beyond the reach of a check leads to `at_odds`, too."""
 
 

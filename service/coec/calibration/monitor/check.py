@@ -84,7 +84,7 @@ def support(there: NDArray[np.float64], expected: NDArray[np.float64]) -> Suppor
 
 
 DEPTH_POINTS = 60_000
-"""Points of the sweeps of a check, in view or not, that the depth witness uses: its hill is degrees wide."""
+"""Points of the sweeps of a check, in view or not, that the depth cue uses: its hill is degrees wide."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -253,7 +253,7 @@ def observe(
 def diagnose(
     window: Window, depth: DepthModel, images: ImageReader, config: CalibrationConfig, baseline: Baseline | None
 ) -> Observation:
-    """The same with both witnesses, whatever the edges say: for a single question rather than a stream of checks.
+    """The same with both cues, whatever the edges say: for a single question rather than a stream of checks.
 
     Raises:
         CalibrationError: as `observe`.

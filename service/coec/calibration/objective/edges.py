@@ -1,4 +1,4 @@
-"""The second witness: edges of the sweeps, of range and of reflectance, laid on edges of the images, at several scales;
+"""The second cue: edges of the sweeps, of range and of reflectance, laid on edges of the images, at several scales;
 and how many independent frames those of a window are worth.
 
 Both kinds of edges add to one significance. Their weights follow from what they are worth in this window: before a pose
@@ -85,7 +85,7 @@ KINDS = len(KIND_NAMES)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeCue:
-    """One witness in four forms: exact and sharp, exact and blurred, bands, and charts.
+    """One cue in four forms: exact and sharp, exact and blurred, bands, and charts.
 
     Attributes:
         kinds: of the edges of `sharp`, of those of a band, and of those of a thinned chart: uint8 each.
@@ -209,7 +209,7 @@ def in_reach(edges: Edges, half_view_rad: float, pose: Matrix4, reach: SearchBox
 
 
 class EdgesAlone:
-    """The edge witness as an objective by itself, at one blur."""
+    """The edge cue as an objective by itself, at one blur."""
 
     def __init__(self, frames: EdgeFrames, blur_rad: float) -> None:
         """`blur_rad` is the blur of the edge maps, an angle about the optical axis."""

@@ -1,4 +1,4 @@
-"""Two independent witnesses in one objective: edges, sharp and unbiased, and depth, broad and blind to texture.
+"""Two independent cues in one objective: edges, sharp and unbiased, and depth, broad and blind to texture.
 
 Each is counted in standard deviations of its own score over other poses within reach, so neither needs a weight: a
 useless network adds only noise of one unit, and so does a scene without edges (METHOD, section 3, "complement").
@@ -83,7 +83,7 @@ class FusedObjective:
         return self._step_rad
 
     def with_depth(self, depth: mutual_information.MutualInformation) -> FusedObjective:
-        """The same edges with another depth witness, on the same scale."""
+        """The same edges with another depth cue, on the same scale."""
         return FusedObjective(self._edges, self._step_rad, depth, self._of_edges, self._of_depth)
 
     def evaluate(self, T_camera_lidar: Matrix4) -> mutual_information.Evaluation:
@@ -162,11 +162,11 @@ class FusedObjective:
 
 
 class Fusion:
-    """Both witnesses of a window, with their scales frozen from poses within reach. Edges that come into view neither
+    """Both cues of a window, with their scales frozen from poses within reach. Edges that come into view neither
     within the reach nor a little outside are left out.
 
     Attributes:
-        edges, depth: the witnesses.
+        edges, depth: the cues.
         start: (4, 4) the pose from which the reach is counted.
         reach: the half-widths of the search.
         ranking: the objectives on which a basin is polished in turn before it is ranked. The coarsest band is not among
@@ -211,7 +211,7 @@ class Fusion:
         return tuple(in_reach(level, self.edges.half_view_rad, self.start, self._seen) for level in levels)
 
     def edge_contrasts(self, poses: NDArray[np.float64]) -> list[float]:
-        """How far the edge witness, averaged over its bands, stands above other poses at each of K poses (K, 4, 4);
+        """How far the edge cue, averaged over its bands, stands above other poses at each of K poses (K, 4, 4);
         standard deviations. Those of two kinds of edges combine as in `ranks`."""
         by_kind = self.contrasts_by_kind(poses)
         if len(by_kind) == 1:
@@ -227,7 +227,7 @@ class Fusion:
         return [_contrasts(bands, scale, poses) for bands, scale in self._kinds]
 
     def depth_contrasts(self, poses: NDArray[np.float64]) -> list[float]:
-        """How far the depth witness stands above other poses at each of K poses (K, 4, 4); standard deviations."""
+        """How far the depth cue stands above other poses at each of K poses (K, 4, 4); standard deviations."""
         return [self._of_depth.standard(at.score) for at in self.depth.evaluate_each(poses)]
 
     def depth_contrast(self, T_camera_lidar: Matrix4) -> float:

@@ -6,7 +6,7 @@ the past (`steps`).
 
 A sensor is named (reported as moved) by two answers in a row, each of which knows of a new look at the sensor, and by
 looks at two of its pairs if it has as many. A run of bad looks at one pair, or one pair that was looked at before the
-others, is denied by the next look. An accepted window is another kind of witness: with it one answer suffices.
+others, is denied by the next look. An accepted window is independent evidence: with it one answer suffices.
 
 Looks alone never name a sensor all of whose pairs are with sensors that also seem to have moved. All that speaks for
 such a sensor is that its pair steps otherwise than the rest, and so does a pair whose looks at a knocked mount are
@@ -213,7 +213,7 @@ def _with_attribution(state: RigState, graph: RigGraph, window: EdgeObservation 
     claimed = {
         name: ANSWERS if name in confirmed else min(state.claimed.get(name, 0) + _is_news(name, graph, state), ANSWERS)
         for name in probable
-        if name in confirmed or name in state.named or _is_witnessed(name, graph, histories, stepped_ns)
+        if name in confirmed or name in state.named or _is_observed_enough(name, graph, histories, stepped_ns)
     }
     return replace(
         state,
@@ -232,7 +232,7 @@ def _likely_by(
     window: EdgeObservation, histories: Mapping[str, EdgeHistory], times_ns: list[int], stepped_ns: int, graph: RigGraph
 ) -> set[str]:
     """The sensors that likely moved if an accepted window replaces all looks at its edge since `stepped_ns`. Those
-    looks may all be bent alike, or come from a poor street; the window is another witness, with a search of its own."""
+    looks may all be bent alike, or come from a poor street; the window is independent evidence, with its own search."""
     history = histories[window.edge]
     observations = tuple(
         observation
@@ -261,7 +261,7 @@ def _is_news(name: str, graph: RigGraph, state: RigState) -> bool:
     return any(observations[-1].stamp_ns > state.attributed_ns for observations in pairs if observations)
 
 
-def _is_witnessed(name: str, graph: RigGraph, histories: Mapping[str, EdgeHistory], since_ns: int) -> bool:
+def _is_observed_enough(name: str, graph: RigGraph, histories: Mapping[str, EdgeHistory], since_ns: int) -> bool:
     """Whether enough was seen of a sensor since a stamp to name it.
 
     If it has several pairs, two of them must have been looked at: a single one may have a fault of its own, such as the

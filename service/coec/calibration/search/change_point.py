@@ -11,7 +11,7 @@ for every frame. The largest gain shows whether there was a change, and its spli
 middle raises neither side, because no split has it alone.
 
 Within the blur of the edges two poses of one scene score alike, but a step may be far larger. So the fine band of the
-edge witness is searched next to the solved pose, a chart as far as a mount is knocked, and both around the best poses
+edge cue is searched next to the solved pose, a chart as far as a mount is knocked, and both around the best poses
 of the chart. The result is settled on the sharpest edges: they resolve half a degree two to three times as well as the
 band, and a scene that fits many poses fits none of them sharply. The split and the poses of its sides are found in
 turns, each from the other, until neither changes.
@@ -357,7 +357,7 @@ AT_ONCE = 36
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DatedEdges:
-    """The edge witness of some pairs, and their stamps, ascending."""
+    """The edge cue of some pairs, and their stamps, ascending."""
 
     stamps_ns: tuple[int, ...]
     edges: EdgeCue

@@ -1,4 +1,4 @@
-"""The global stage: finds every basin of the edge witness within reach of the start, from coarse to fine, in bounded
+"""The global stage: finds every basin of the edge cue within reach of the start, from coarse to fine, in bounded
 time.
 
 A low-discrepancy cover of the reach is scored on the coarsest level with few edges, and the better part of it with
@@ -103,7 +103,7 @@ SHIFTED = _Round(10 * SHIFTED_POSES, 0.0, FINE, thinned=False, points=4_000, ste
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Basin:
-    """A local maximum of the edge witness: its pose (4, 4) and its significance on the fine chart."""
+    """A local maximum of the edge cue: its pose (4, 4) and its significance on the fine chart."""
 
     T_camera_lidar: Matrix4
     significance: float

@@ -140,25 +140,9 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
     if not path.is_file():
         layouts = "kitti360:..., kitti-raw:... or kitti-odometry:..."
         raise SourceError(f"{spec.path} has no {FILE_NAME}; for a KITTI folder write {layouts}")
-    try:
-        text, _ = load_camera_document(path)
-    except ConfigError as error:
-        raise SourceError(str(error)) from error
-    if cameras_of(text, (1, 1)):
-        raise SourceError(
-            f"{path} holds the intrinsics of a camera, not a list of frames: name it as `camera: {path.name}` "
-            f"in a {FILE_NAME}, or behind a bag as BAG?intrinsics={path.name}"
-        )
-    try:
-        document = ManifestDocument.model_validate(with_camera(text, path))
-        camera = camera_of(document.camera)
-        T_camera_lidar = np.array(document.T_camera_lidar, dtype=np.float64)
-        T_cloud_lidar = np.array(document.T_cloud_lidar, dtype=np.float64)
-        mask = None if document.mask is None else load_mask(path.parent / document.mask, camera)
-    except ValidationError as error:
-        raise SourceError(f"{path}: {describe(error)}") from error
-    except ConfigError as error:
-        raise SourceError(f"{path}: {error}") from error
+    document, camera, mask = _read(path)
+    T_camera_lidar = np.array(document.T_camera_lidar, dtype=np.float64)
+    T_cloud_lidar = np.array(document.T_cloud_lidar, dtype=np.float64)
     rig = types.Rig(
         pair=document.pair,
         camera=camera,
@@ -197,6 +181,28 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
         frames=tuple(replace(frame, load_lidar=partial(_at, frame.load_lidar, instant)) for frame in recording.frames),
         recognitions=() if recognition is None else (recognition,),
     )
+
+
+def _read(path: Path) -> tuple[ManifestDocument, Camera, NDArray[np.bool_] | None]:
+    """The document of a manifest, its camera, and the mask that it names."""
+    try:
+        text, _ = load_camera_document(path)
+    except ConfigError as error:
+        raise SourceError(str(error)) from error
+    if cameras_of(text, (1, 1)):
+        raise SourceError(
+            f"{path} holds the intrinsics of a camera, not a list of frames: name it as `camera: {path.name}` "
+            f"in a {FILE_NAME}, or behind a bag as BAG?intrinsics={path.name}"
+        )
+    try:
+        document = ManifestDocument.model_validate(with_camera(text, path))
+        camera = camera_of(document.camera)
+        mask = None if document.mask is None else load_mask(path.parent / document.mask, camera)
+    except ValidationError as error:
+        raise SourceError(f"{path}: {describe(error)}") from error
+    except ConfigError as error:
+        raise SourceError(f"{path}: {error}") from error
+    return document, camera, mask
 
 
 def _compensated(recording: FramewiseRecording) -> tuple[str | None, types.Recognition | None]:
