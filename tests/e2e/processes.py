@@ -38,7 +38,7 @@ from coec.schemas.keys import Keys
 from conftest import REPOSITORY
 
 COMMAND: Sequence[str] = [sys.executable, "-m", "coec"]
-PATIENCE_S = 180.0
+PATIENCE_S = 600.0
 """Within this a step must have come about; on two idle cores the longest, the first start, takes some 10 s. Nothing
 waits so long that comes about: how fast it does is no test's verdict."""
 
