@@ -85,7 +85,6 @@ WIRE = {
     "service/coec/schemas/rig_state.py": {"looks"},
     "service/coec/service/discovery.py": {"asked", "found_ns"},
     "service/coec_lab/experiments/evaluation_schema.py": {"told_s", "wanted", "wanted_s"},
-    "service/coec_lab/experiments/mount_steps.py": {"told_s"},
     "service/coec_lab/experiments/simulation_schemas.py": {"KnockedRow", "RigLook", "biased_found", "knocked", "looks"},
     "tests/upgrade/test_step_back.py": {"independent_looks"},
 }

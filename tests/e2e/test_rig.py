@@ -24,7 +24,7 @@ from coec.geometry.se3 import inverse, rotation_angle_rad
 from coec.io.zenoh.player import Player, SensorKeys
 from coec.schemas.message import from_msgpack
 from coec.schemas.rig_state import RigCorrection, RigReply
-from coec_lab.commands.rig_play import document_of
+from coec_lab.simulation.source import document_of
 from e2e.processes import PATIENCE_S, Router, Service, service
 from e2e.rig_street import FOUR_AND_ONE, LIDAR, TWO_AND_THREE, Knock, Street, second_of
 

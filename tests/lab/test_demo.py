@@ -20,17 +20,29 @@ from coec.calibration.types import EgoMotion
 from coec.config import WindowConfig
 from coec.reports.page import render
 from coec.schemas import replies
-from coec_lab.demo import pair_drive, pair_report
+from coec_lab.demo import pair_client, pair_report
 from coec_lab.demo.pair import BARS, Screen, curve, view
-from coec_lab.demo.pair_client import Moment, PairOutcome, Snapshot, outcome_of, with_alarm
-from coec_lab.demo.pair_drive import LEAD_NS, NS_PER_S, STEP_NS, Pace, PairVehicle, at_rest, paced
+from coec_lab.demo.pair_client import (
+    LEAD_NS,
+    NS_PER_S,
+    STEP_NS,
+    Moment,
+    Pace,
+    PairOutcome,
+    PairVehicle,
+    Snapshot,
+    at_rest,
+    outcome_of,
+    paced,
+    with_alarm,
+)
 from coec_lab.demo.pair_report import demo_page
 from reports.pages import MADE
 from support.messages import status_reply
 
 pytestmark = pytest.mark.usefixtures("streets")
 
-KNOCK_S, MAX_ERROR_DEG = pair_drive.KNOCK_S, pair_drive.MAX_ERROR_DEG
+KNOCK_S, MAX_ERROR_DEG = pair_client.KNOCK_S, pair_client.MAX_ERROR_DEG
 
 START = Moment(
     t_s=3.0, drive_s=0.0, service="running", health="unknown", provenance="nominal", status="not_accepted",
@@ -210,13 +222,13 @@ def test_the_service_is_configured_as_on_a_vehicle_but_for_the_haste() -> None:
     pytest.importorskip("embreex", reason="needs ray casting")
     from coec_lab.simulation.drive import SimulatedDrive
 
-    drive = SimulatedDrive(replace(pair_drive.drive_config(), seconds=2.0))
-    config = pair_drive.service_config(drive.rig, Path("mask.png"), "tcp/127.0.0.1:1")
+    drive = SimulatedDrive(replace(pair_client.drive_config(), seconds=2.0))
+    config = pair_client.service_config(drive.rig, Path("mask.png"), "tcp/127.0.0.1:1")
     (pair,) = config.pairs
     assert pair.calibration.objective.kind == "fused"
     assert pair.calibration == type(pair.calibration)(), "with the network that comes with it"
     assert (pair.policy, pair.tracker) == (type(pair.policy)(), type(pair.tracker)())
-    left, top, width, height = pair_drive.CLOSE_UP_PX
+    left, top, width, height = pair_client.CLOSE_UP_PX
     assert left + width <= drive.rig.camera.width
     assert top + height <= drive.rig.camera.height
 
@@ -225,7 +237,7 @@ def test_there_is_something_to_check_before_the_service_reports_anything(tmp_pat
     pytest.importorskip("embreex", reason="needs ray casting")
     from coec_lab.simulation.drive import SimulatedDrive
 
-    drive = SimulatedDrive(replace(pair_drive.drive_config(), seconds=2.0, camera="fisheye160", lidar="16"))
+    drive = SimulatedDrive(replace(pair_client.drive_config(), seconds=2.0, camera="fisheye160", lidar="16"))
     picture, page = pair_report.write_first(tmp_path, drive)
     seen = cv2.imread(str(picture))
     assert seen is not None
@@ -233,7 +245,7 @@ def test_there_is_something_to_check_before_the_service_reports_anything(tmp_pat
     result = page.read_text()
     assert "Under way" in result
     assert "data:image/" in result
-    assert page.name == pair_drive.REPORT, "the report takes its place"
+    assert page.name == pair_client.REPORT, "the report takes its place"
 
 
 def check_files(document: Any) -> list[Path]:
@@ -255,12 +267,12 @@ def test_a_drive_that_ends_before_the_first_window_ends_as_one_that_did_not_come
     from coec_lab.simulation.drive import DriveConfig
 
     brief = DriveConfig(
-        seed=pair_drive.SEED, seconds=4.0, camera="fisheye160", lidar="16", camera_hz=1.0, lidar_hz=1.0, ego_hz=2.0,
-        workshop=pair_drive.WORKSHOP,
+        seed=pair_client.SEED, seconds=4.0, camera="fisheye160", lidar="16", camera_hz=1.0, lidar_hz=1.0, ego_hz=2.0,
+        workshop=pair_client.WORKSHOP,
     )  # fmt: skip
-    monkeypatch.setattr(pair_drive, "drive_config", lambda: brief)
-    monkeypatch.setattr(pair_drive, "RENDERERS", 1)
-    monkeypatch.setattr(pair_drive, "CLOSE_UP_PX", tuple(value * 160 // 700 for value in pair_drive.CLOSE_UP_PX))
+    monkeypatch.setattr(pair_client, "drive_config", lambda: brief)
+    monkeypatch.setattr(pair_client, "RENDERERS", 1)
+    monkeypatch.setattr(pair_client, "CLOSE_UP_PX", tuple(value * 160 // 700 for value in pair_client.CLOSE_UP_PX))
     vehicles: list[PairVehicle] = []
 
     class Watched(PairVehicle):
@@ -289,12 +301,12 @@ def test_a_short_drive_without_a_knock_is_calibrated_and_ends_as_one_that_did_no
 
     # So long that it cannot be over before the window has been judged: see `pace.LEAD_NS`.
     quiet = DriveConfig(
-        seed=pair_drive.SEED, seconds=32.0, camera="fisheye600", lidar="64", camera_hz=1.0, lidar_hz=1.0, ego_hz=2.0,
-        workshop=pair_drive.WORKSHOP,
+        seed=pair_client.SEED, seconds=32.0, camera="fisheye600", lidar="64", camera_hz=1.0, lidar_hz=1.0, ego_hz=2.0,
+        workshop=pair_client.WORKSHOP,
     )  # fmt: skip
-    monkeypatch.setattr(pair_drive, "drive_config", lambda: quiet)
-    monkeypatch.setattr(pair_drive, "WINDOW", WindowConfig(pairs=12, min_pairs=8, slice_s=12.0))
-    monkeypatch.setattr(pair_drive, "CLOSE_UP_PX", tuple(value * 6 // 7 for value in pair_drive.CLOSE_UP_PX))
+    monkeypatch.setattr(pair_client, "drive_config", lambda: quiet)
+    monkeypatch.setattr(pair_client, "WINDOW", WindowConfig(pairs=12, min_pairs=8, slice_s=12.0))
+    monkeypatch.setattr(pair_client, "CLOSE_UP_PX", tuple(value * 6 // 7 for value in pair_client.CLOSE_UP_PX))
     outcome = coec("demo", "--json", "--output", tmp_path / "demo")
     assert outcome.status == 1
     document = outcome.document

@@ -18,8 +18,8 @@ from dataclasses import replace
 from cli.conftest import Coec
 from coec_lab.demo import rig
 from coec_lab.demo.demo_plots import PlottedEdge
-from coec_lab.demo.pair_drive import NS_PER_S
-from coec_lab.demo.rig_drive import (
+from coec_lab.demo.pair_client import NS_PER_S
+from coec_lab.demo.rig import (
     AHEAD,
     SCENARIO,
     ActOutcome,

@@ -55,7 +55,7 @@ from coec.schemas.replies import (
 )
 from coec.schemas.replies import Reason as Said
 from coec_lab.demo import rig as rig_of_demo
-from coec_lab.demo import rig_drive
+from coec_lab.demo import rig as rig_vehicle
 from coec_lab.demo.pair_client import Moment, outcome_of
 from coec_lab.demo.pair_report import demo_page
 from coec_lab.experiments import evaluation_charts, evaluation_page, paper_figures
@@ -382,15 +382,15 @@ def demo(folder: Path) -> Page:
 
 def rig_demo(folder: Path) -> Page:
     """Of `coec demo --rig`."""
-    scenario = rig_drive.SCENARIO
+    scenario = rig_vehicle.SCENARIO
     act = scenario.acts[0]
     names = {scenario.lidar: "lidar", "front": "camera", "left": "camera", "rear": "camera", "right": "camera"}
     snapshots = [
-        rig_drive.RigSnapshot(
+        rig_vehicle.RigSnapshot(
             second=second,
             checked="roof_front",
             sensors={
-                name: rig_drive.SensorCondition(
+                name: rig_vehicle.SensorCondition(
                     name, kind, "lidar_moved" if moved and kind == "lidar" else "calibrated",
                     1.0 if moved and kind == "lidar" else 0.0, None, f"{name} is as it was",
                 )
@@ -400,7 +400,7 @@ def rig_demo(folder: Path) -> Page:
         )
         for second, moved in ((4.0, False), (scenario.knock_s + 9.0, True))
     ]  # fmt: skip
-    outcome = rig_drive.outcome_of(act, snapshots, scenario.knock_s)
+    outcome = rig_vehicle.outcome_of(act, snapshots, scenario.knock_s)
     return rig_of_demo.page(files(folder, "lidar_knocked"), [(outcome, snapshots)], MADE, scenario)
 
 

@@ -90,8 +90,8 @@ def _compile(lenses: Sequence[str]) -> int:
     from coec.config import Config
     from coec.geometry import compilation_events
     from coec.service.worker.compilation import compiled
-    from coec.service.worker.second_compiler import second_compiler
     from coec.service.worker.tasks import Solver
+    from coec.service.worker.warm_up import second_compiler
 
     config = Config.model_validate({"pairs": list(_pairs(lenses))})
     total = compiled(len(lenses)).total

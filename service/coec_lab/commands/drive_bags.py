@@ -21,8 +21,7 @@ from coec.io.ros.topics import SensorTopics, TopicMessage, image_topic, points_t
 from coec.io.user_files import require_absent, write_output
 from coec.reports import console
 from coec.reports.formatting import count
-from coec_lab.commands.rig_play import vehicle_of
-from coec_lab.simulation.source import open_rig, open_sim
+from coec_lab.simulation.source import open_rig, open_sim, vehicle_of
 
 if TYPE_CHECKING:
     from coec_lab.simulation.drive import SimulatedDrive

@@ -1,4 +1,4 @@
-"""`coec evaluate`: options and their combinations. `starts_experiment` and `closure_experiment` do the work."""
+"""`coec evaluate`: options and their combinations. `starts_experiment` and `experiments.closure` do the work."""
 
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -119,7 +119,8 @@ def evaluate(
             "--closure is an experiment of its own: leave out --objective all, --against-frames, --against-slice, "
             "--halves, --nees, --detection, --steps and --camera-model"
         )
-    from coec_lab.commands import closure_experiment, starts_experiment
+    from coec_lab.commands import starts_experiment
+    from coec_lab.experiments import closure as closure_experiment
     from coec_lab.experiments.evaluation_run import Plan
 
     given = {**options, "objective": objective, "dof": None if dof is None else int(dof)}

@@ -239,7 +239,7 @@ def _figures(outcomes: Sequence[SolveOutcome]) -> dict[str, Any]:
         "runs": of.starts,
         "hits": of.hits,
         "classified_correctly": of.classified_correctly,
-        "verdicts": asdict(of.verdicts),
+        "verdicts": of.verdicts.model_dump(),
         "rotation_deg": {
             "median": degrees(of.rotation_rad.median),
             "p95": degrees(of.rotation_rad.p95),

@@ -34,9 +34,8 @@ from coec.reports.commented_yaml import commented_yaml
 from coec.reports.console import COMPILING, COMPILING_S, CompilationProgress
 from coec.reports.formatting import count
 from coec.schemas.keys import Keys
-from coec_lab.demo import pair_drive, pair_report
-from coec_lab.demo.pair_client import Observer, PairOutcome, Snapshot, outcome_of
-from coec_lab.demo.pair_drive import NS_PER_S, Pace, PairVehicle
+from coec_lab.demo import pair_client, pair_report
+from coec_lab.demo.pair_client import NS_PER_S, Observer, Pace, PairOutcome, PairVehicle, Snapshot, outcome_of
 from coec_lab.demo.service import QUERY_S, Daemon, DemoError, free_endpoint, running
 
 if TYPE_CHECKING:
@@ -71,7 +70,7 @@ def run(output: Path, *, as_json: bool) -> int:
     """
     files.try_folder(output)
     started_s = time.monotonic()
-    config_of_drive = pair_drive.drive_config()
+    config_of_drive = pair_client.drive_config()
     from coec_lab.simulation.drive import SimulatedDrive
 
     drive = SimulatedDrive(config_of_drive)
@@ -114,7 +113,7 @@ def _configure(drive: SimulatedDrive, folder: Path) -> Config:
     rig = drive.rig
     mask = np.ones((rig.camera.height, rig.camera.width), bool) if rig.mask is None else rig.mask
     files.write_output(folder / "mask.png", mask_to_png(mask))
-    config = pair_drive.service_config(rig, Path("mask.png"), free_endpoint())
+    config = pair_client.service_config(rig, Path("mask.png"), free_endpoint())
     files.write_output(folder / "coec.yaml", commented_yaml(config).encode())
     return config
 
@@ -154,8 +153,8 @@ def _observe(observer: Observer, vehicle: PairVehicle, daemon: Daemon, screen: S
             if snapshot is None:
                 raise DemoError("the service no longer answers", daemon.log_tail())
             screen.show(observer, snapshot)
-            outcome = outcome_of(observer.timeline, pair_drive.KNOCK_S, pair_drive.MAX_ERROR_DEG)
-            finished = outcome.repaired_s is not None and vehicle.second >= outcome.repaired_s + pair_drive.REST_S
+            outcome = outcome_of(observer.timeline, pair_client.KNOCK_S, pair_client.MAX_ERROR_DEG)
+            finished = outcome.repaired_s is not None and vehicle.second >= outcome.repaired_s + pair_client.REST_S
             if finished or arrived or time.monotonic() > deadline_s:
                 return snapshot, outcome
             time.sleep(POLL_S)
@@ -182,7 +181,7 @@ def _document(
     return {
         "timeline": [asdict(moment) for moment in observer.timeline],
         "knock_s": outcome.knock_s,
-        "knock_deg": pair_drive.KNOCK_DEG,
+        "knock_deg": pair_client.KNOCK_DEG,
         "alarm_s": outcome.alarm_s,
         "repaired_s": outcome.repaired_s,
         "error_before_deg": outcome.error_before_deg,
@@ -278,7 +277,7 @@ def curve(series: Sequence[tuple[float, float, str]], width: int = CURVE_WIDTH) 
             text.append(" ")
             continue
         error_deg, health = latest[column]
-        height = min(int(error_deg / (pair_drive.KNOCK_DEG * 1.1) * len(BARS)), len(BARS) - 1)
+        height = min(int(error_deg / (pair_client.KNOCK_DEG * 1.1) * len(BARS)), len(BARS) - 1)
         text.append(BARS[height], console.STATE_STYLES.get(health, "dim"))
     return text
 
@@ -289,15 +288,15 @@ def _before(t_s: float) -> Text:
 
 
 def _drive(second: float) -> Text:
-    if second < pair_drive.KNOCK_S:
-        left_s = pair_drive.KNOCK_S - second
-        return Text(f"{second:5.1f} s   the mount is displaced by {pair_drive.KNOCK_DEG:g}° in {left_s:.0f} s")
-    ago = f"{second - pair_drive.KNOCK_S:.0f} s ago"
-    return Text.assemble(f"{second:5.1f} s   ", (f"DISPLACED by {pair_drive.KNOCK_DEG:g}° {ago}", "bold magenta"))
+    if second < pair_client.KNOCK_S:
+        left_s = pair_client.KNOCK_S - second
+        return Text(f"{second:5.1f} s   the mount is displaced by {pair_client.KNOCK_DEG:g}° in {left_s:.0f} s")
+    ago = f"{second - pair_client.KNOCK_S:.0f} s ago"
+    return Text.assemble(f"{second:5.1f} s   ", (f"DISPLACED by {pair_client.KNOCK_DEG:g}° {ago}", "bold magenta"))
 
 
 def _error(snapshot: Snapshot) -> Text:
-    style = "bold green" if snapshot.moment.error_deg < pair_drive.MAX_ERROR_DEG else "bold red"
+    style = "bold green" if snapshot.moment.error_deg < pair_client.MAX_ERROR_DEG else "bold red"
     return Text(f"{snapshot.moment.error_deg:.3f}°", style)
 
 
@@ -316,8 +315,8 @@ def _worker(snapshot: Snapshot) -> str:
 
 def _window(selected: int) -> RenderableType:
     grid = Table.grid(padding=(0, 2))
-    bar = ProgressBar(total=pair_drive.WINDOW.pairs, completed=selected, width=BAR_WIDTH)
-    grid.add_row(bar, f"{selected} of {pair_drive.WINDOW.pairs} pairs")
+    bar = ProgressBar(total=pair_client.WINDOW.pairs, completed=selected, width=BAR_WIDTH)
+    grid.add_row(bar, f"{selected} of {pair_client.WINDOW.pairs} pairs")
     return grid
 
 

@@ -29,7 +29,7 @@ from coec.reports.page import Block, Cell, Charts, Compare, Facts, Page, Picture
 from coec.reports.page_parts import TONES, Provenance, copies_of, figures_block, file_picture
 from coec.schemas import replies
 from coec.schemas.message import to_json
-from coec_lab.demo import pair_drive
+from coec_lab.demo import pair_client
 from coec_lab.demo.demo_plots import timeline
 from coec_lab.demo.pair_client import ALARM, Moment, Observer, PairOutcome, Snapshot, is_repaired
 
@@ -41,7 +41,7 @@ PICTURE = "first_picture"
 
 FIRST_ABOUT = (
     "A simulated vehicle drives, and the service of a real one receives its camera and its LiDAR. Its mount will be "
-    f"displaced by {pair_drive.KNOCK_DEG:g}° after {pair_drive.KNOCK_S:g} s. When the demonstration "
+    f"displaced by {pair_client.KNOCK_DEG:g}° after {pair_client.KNOCK_S:g} s. When the demonstration "
     "ends, this page shows its result: load it again then."
 )
 
@@ -77,11 +77,11 @@ def write_first(output: Path, drive: SimulatedDrive) -> tuple[Path, Path]:
     picture = pictures.write_overlay(output, PICTURE, overlay, title)
     stand_in = Page(
         "coec demo",
-        pair_drive.TITLE,
+        pair_client.TITLE,
         (VerdictBanner("none", "Under way.", "The service has not reported anything yet."), Text((FIRST_ABOUT,))),
         (Section("What the vehicle sees", (Pictures((file_picture(picture),)),)), Provenance.here().section()),
     )
-    return picture, page.write(output / pair_drive.REPORT, stand_in)
+    return picture, page.write(output / pair_client.REPORT, stand_in)
 
 
 def write(
@@ -105,7 +105,8 @@ def write(
     """
     written = [first] if window is None else [first, window]
     plot = write_file(
-        output / "timeline.png", timeline(observer.series, _marks(outcome), pair_drive.MAX_ERROR_DEG, pair_drive.TITLE)
+        output / "timeline.png",
+        timeline(observer.series, _marks(outcome), pair_client.MAX_ERROR_DEG, pair_client.TITLE),
     )
     written.append(plot)
     result, compared = None, None
@@ -118,9 +119,9 @@ def write(
     happened = list(zip(observer.timeline, _happenings(observer.timeline, outcome), strict=True))
     summary = _summary(outcome, observer.timeline)
     document = demo_page(
-        pair_drive.TITLE, observer.series, happened, summary, outcome, result, compared, window, Provenance.here()
+        pair_client.TITLE, observer.series, happened, summary, outcome, result, compared, window, Provenance.here()
     )
-    written.append(page.write(output / pair_drive.REPORT, document))
+    written.append(page.write(output / pair_client.REPORT, document))
     return WrittenFiles(tuple(written), result)
 
 
@@ -175,7 +176,7 @@ def _overlays(
 def _close_up(window: Window, xyz_m: NDArray[np.floating], T_camera_lidar: Matrix4) -> NDArray[np.uint8]:
     """(height, width, 3) BGR: the part of the picture that shows the street, with the points (N, 3) of the sweep."""
     pair, rig = pictures.middle(window), window.rig
-    left, top, width, height = pair_drive.CLOSE_UP_PX
+    left, top, width, height = pair_client.CLOSE_UP_PX
     part = slice(top, top + height), slice(left, left + width)
     intrinsics = cameras.intrinsics_of(rig.camera)
     moved = {"cx": intrinsics["cx"] - left, "cy": intrinsics["cy"] - top, "width": width, "height": height}
@@ -200,7 +201,7 @@ def _happenings(moments: Sequence[Moment], outcome: PairOutcome) -> list[str]:
         ("alarm", lambda moment: moment.drive_s == outcome.alarm_s and moment.health == ALARM),
         (
             "corrected",
-            lambda moment: moment.drive_s == outcome.repaired_s and is_repaired(moment, pair_drive.MAX_ERROR_DEG),
+            lambda moment: moment.drive_s == outcome.repaired_s and is_repaired(moment, pair_client.MAX_ERROR_DEG),
         ),
     )
     notes = [""] * len(moments)
@@ -222,7 +223,7 @@ def _summary(outcome: PairOutcome, moments: Sequence[Moment]) -> list[tuple[str,
     return [
         ("error of the workshop's calibration", f"{moments[0].error_deg:.3f}°"),
         ("error after the first window", f"{early[0].error_deg:.3f}°" if early else "no window was accepted"),
-        ("displacement", f"{pair_drive.KNOCK_DEG:g}° in pitch at {outcome.knock_s:.0f} s of driving"),
+        ("displacement", f"{pair_client.KNOCK_DEG:g}° in pitch at {outcome.knock_s:.0f} s of driving"),
         ("alarm", after_knock(outcome.alarm_s)),
         ("correction", after_knock(outcome.repaired_s)),
         ("error after the displacement", f"{outcome.error_before_deg:.3f}°"),
@@ -284,7 +285,7 @@ def _curve(series: Sequence[Sample], outcome: PairOutcome) -> Chart:
         description=f"the error is {worst_deg:.2f}° at most and {series[-1][1]:.2f}° at the end",
         grounds=tuple(grounds),
         marks=tuple(Mark(second, f"{name}, {second:.0f} s") for second, name in marks if second is not None),
-        limits=(Limit(pair_drive.MAX_ERROR_DEG, f"{pair_drive.MAX_ERROR_DEG:g}°: a good error"),),
+        limits=(Limit(pair_client.MAX_ERROR_DEG, f"{pair_client.MAX_ERROR_DEG:g}°: a good error"),),
         from_zero=True,
     )
 

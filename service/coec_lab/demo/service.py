@@ -27,7 +27,7 @@ from coec.schemas.keys import Keys
 from coec.schemas.message import from_json
 from coec.schemas.replies import HealthReply, StatusReply
 from coec.schemas.rig_state import RigReply
-from coec_lab.commands.rig_play import document_of
+from coec_lab.simulation.source import document_of
 
 if TYPE_CHECKING:
     from coec_lab.simulation.rig_drive import RigDrive

@@ -22,6 +22,7 @@ from coec.config import CalibrationConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3
 from coec.geometry.points import random_direction
+from coec_lab.experiments.evaluation_schema import DetectionRow
 
 RIGHT = "right"
 """Name of the case without a move."""
@@ -47,21 +48,6 @@ SEED = 20_230_617
 
 CONFIDENCE = 0.95
 """Confidence of the interval of a share."""
-
-
-@dataclass(frozen=True, slots=True)
-class Detection:
-    """Checks after one kind of move: their number, the share that each classifier flagged, and for the deciding one the
-    interval of that share at `CONFIDENCE`, as if no two checks shared a pair. At the right pose the flagged checks are
-    false alarms. `undecided` is the share that the deciding classifier left open."""
-
-    name: str
-    checks: int
-    flagged: float
-    flagged_low: float
-    flagged_high: float
-    undecided: float
-    flagged_by_paper: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,16 +116,25 @@ def try_detection(
     return tried
 
 
-def table(tried: Sequence[TriedCheck]) -> tuple[Detection, ...]:
-    """The shares by move, in the order of `MOVES`."""
+def table(tried: Sequence[TriedCheck]) -> tuple[DetectionRow, ...]:
+    """The shares by move, in the order of `MOVES`. The interval holds as if no two checks shared a pair."""
     rows = []
     for name, _, _ in MOVES:
         of = [one for one in tried if one.name == name]
         if of:
             flagged = sum(one.opinion is Opinion.FLAGGED for one in of)
-            undecided = sum(one.opinion is Opinion.UNDECIDED for one in of) / len(of)
-            by_paper = sum(one.flagged_by_paper for one in of) / len(of)
-            rows.append(Detection(name, len(of), flagged / len(of), *interval(flagged, len(of)), undecided, by_paper))
+            low, high = interval(flagged, len(of))
+            rows.append(
+                DetectionRow(
+                    name=name,
+                    checks=len(of),
+                    flagged=flagged / len(of),
+                    flagged_low=low,
+                    flagged_high=high,
+                    undecided=sum(one.opinion is Opinion.UNDECIDED for one in of) / len(of),
+                    flagged_by_paper=sum(one.flagged_by_paper for one in of) / len(of),
+                )
+            )
     return tuple(rows)
 
 

@@ -1,17 +1,14 @@
 """Converts the statistics of an evaluation to wire models: degrees instead of radians, null instead of NaN."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from math import degrees
 from typing import cast
 
 from coec.reports.page_parts import finite_degrees, finite_or_none, finite_values
 from coec.schemas.replies import Maybe6
 from coec_lab.experiments import evaluation_schema as wire
-from coec_lab.experiments import mount_steps, solve_statistics
-from coec_lab.experiments.closure import Closure
+from coec_lab.experiments import solve_statistics
 from coec_lab.experiments.detection import TriedCheck, table
-from coec_lab.experiments.mount_steps import MountStepTrial
 from coec_lab.experiments.solve_statistics import BIN_EDGES, CONFIDENCES, Halves, NormalisedErrors
 
 
@@ -27,11 +24,6 @@ def spread_of(spread: solve_statistics.SpreadStatistics, scale: float = 1.0) -> 
 def angle_spread_of(spread_rad: solve_statistics.SpreadStatistics) -> wire.Spread:
     """The spread of an angle, radians, in degrees."""
     return spread_of(spread_rad, degrees(1.0))
-
-
-def verdicts_of(verdicts: solve_statistics.Verdicts) -> wire.VerdictCounts:
-    """The same counts."""
-    return wire.VerdictCounts(**asdict(verdicts))
 
 
 def frames_point_of(point: solve_statistics.FrameCountStatistics) -> wire.FramesPoint:
@@ -78,13 +70,7 @@ def halves_of(halves: Halves) -> wire.HalvesReport:
 
 def detection_of(tried: Sequence[TriedCheck], splits: int, pairs: int) -> wire.DetectionReport:
     """The checks of `try_detection` over `splits` splits of `pairs` pairs, counted by move."""
-    moves = tuple(wire.DetectionRow(**asdict(row)) for row in table(tried))
-    return wire.DetectionReport(splits=splits, pairs=pairs, moves=moves)
-
-
-def steps_of(tried: Sequence[MountStepTrial]) -> tuple[wire.StepRow, ...]:
-    """The windows of `try_knocks`, counted by knock."""
-    return tuple(wire.StepRow(**asdict(row)) for row in mount_steps.table(tried))
+    return wire.DetectionReport(splits=splits, pairs=pairs, moves=table(tried))
 
 
 def normalised_of(against: str, errors: NormalisedErrors) -> wire.NormalisedErrorsReport:
@@ -110,17 +96,4 @@ def normalised_of(against: str, errors: NormalisedErrors) -> wire.NormalisedErro
         nees=finite_or_none(errors.nees),
         nees_low=finite_or_none(low),
         nees_high=finite_or_none(high),
-    )
-
-
-def closure_of(closure: Closure) -> wire.ClosureGroup:
-    """Closure errors on some frames."""
-    pairs_a, pairs_b = closure.pairs
-    return wire.ClosureGroup(
-        frames=closure.frames.value,
-        pairs_a=pairs_a,
-        pairs_b=pairs_b,
-        errors=normalised_of("the known pose between both", closure.normalised),
-        rotation_deg=angle_spread_of(closure.rotation_rad),
-        translation_m=spread_of(closure.translation_m),
     )

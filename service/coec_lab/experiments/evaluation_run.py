@@ -23,7 +23,7 @@ from coec.recording import CallbackProgress, Recording, fit_camera
 from coec.recording import Window as PublicWindow
 from coec.reports.page_parts import finite_degrees
 from coec.schemas.replies import Vector6
-from coec_lab.experiments import evaluation_documents, solve_experiments, solve_statistics
+from coec_lab.experiments import evaluation_documents, mount_steps, solve_experiments, solve_statistics
 from coec_lab.experiments.detection import require_enough
 from coec_lab.experiments.evaluation_schema import DetectionReport, EvaluationReport, StepRow
 from coec_lab.experiments.solve_experiments import Bench, Stages
@@ -214,7 +214,7 @@ def _try_further(
         seen = solve_experiments.detected(bench, plan.detection, solve_experiments.CHECKS, stages)
         done.detection = evaluation_documents.detection_of(seen, plan.detection, len(bench.window.pairs))
     if plan.steps:
-        done.steps = evaluation_documents.steps_of(solve_experiments.mount_step_trials(bench, plan.steps, stages))
+        done.steps = mount_steps.table(solve_experiments.mount_step_trials(bench, plan.steps, stages))
 
 
 def _truth(source: str, bench: Bench) -> tuple[str, Callable[[int], Matrix4]]:
@@ -269,7 +269,7 @@ def report_of(
         solve_s=evaluation_documents.spread_of(summary.solve_s),
         evaluations=evaluation_documents.spread_of(summary.evaluations),
         classified_correctly=summary.classified_correctly,
-        verdicts=evaluation_documents.verdicts_of(summary.verdicts),
+        verdicts=summary.verdicts,
         stop_reasons=summary.stop_reasons,
         worst_start=solve_statistics.worst(done.outcomes),
         frames=tuple(evaluation_documents.frames_point_of(point) for point in done.frames),

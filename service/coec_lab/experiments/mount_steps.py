@@ -31,6 +31,7 @@ from coec.config import CalibrationConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3
 from coec.geometry.points import random_direction
+from coec_lab.experiments.evaluation_schema import StepRow
 
 WRONG_RAD, WRONG_SIGMAS = radians(0.3), 4.0
 """An accepted window is wrong if its rotation is farther than both of these from the mount at the window's end."""
@@ -100,23 +101,6 @@ class MountStepTrial:
     late: float
 
 
-@dataclass(frozen=True, slots=True)
-class MountStepRow:
-    """The windows with one knock: shares of them, and for a step the share whose time is known. Over the windows with a
-    reported time: the medians of its error, s, and of the reported interval's length, s, and the share of intervals
-    that hold the knock."""
-
-    name: str
-    windows: int
-    accepted: float
-    wrong: float
-    moved: float
-    time_known: float | None
-    off_s: float | None
-    told_s: float | None
-    holds: float | None
-
-
 def try_mount_steps(
     window: Window,
     depth: DepthModel,
@@ -149,7 +133,7 @@ def try_mount_steps(
     return tried
 
 
-def table(tried: Sequence[MountStepTrial]) -> tuple[MountStepRow, ...]:
+def table(tried: Sequence[MountStepTrial]) -> tuple[StepRow, ...]:
     """The shares by knock, in the order of their first trials."""
     rows = []
     for name in dict.fromkeys(one.name for one in tried):
@@ -158,16 +142,16 @@ def table(tried: Sequence[MountStepTrial]) -> tuple[MountStepRow, ...]:
         has_time = not any(knock.name == name and (knock.creeps or not knock.moves) for knock in MOUNT_STEPS)
         timed = [one for one in of if one.off_s is not None]
         rows.append(
-            MountStepRow(
-                name,
-                len(of),
-                sum(one.accepted for one in of) / len(of),
-                sum(one.wrong for one in of) / len(of),
-                sum(one.moved for one in of) / len(of),
-                sum(known) / len(of) if has_time else None,
-                _median([one.off_s for one in timed]),
-                _median([one.interval_s for one in timed]),
-                sum(bool(one.holds) for one in timed) / len(timed) if timed else None,
+            StepRow(
+                name=name,
+                windows=len(of),
+                accepted=sum(one.accepted for one in of) / len(of),
+                wrong=sum(one.wrong for one in of) / len(of),
+                moved=sum(one.moved for one in of) / len(of),
+                time_known=sum(known) / len(of) if has_time else None,
+                off_s=_median([one.off_s for one in timed]),
+                told_s=_median([one.interval_s for one in timed]),
+                holds=sum(bool(one.holds) for one in timed) / len(timed) if timed else None,
             )
         )
     return tuple(rows)

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from coec.calibration.baseline import chi2_quantile
 from coec.calibration.types import Decision, Estimate, Matrix4
 from coec.geometry import se3
+from coec_lab.experiments.evaluation_schema import VerdictCounts
 
 HIT_RAD, HIT_M = radians(0.5), 0.20
 """A hit ends nearer than this to the reference (WACV 2024); the translation counts only where it was searched."""
@@ -80,16 +81,6 @@ class SpreadStatistics:
     max: float
 
 
-@dataclass(frozen=True, slots=True)
-class Verdicts:
-    """Starts by decision and truth. An accepted miss is the dangerous one: a wrong pose that would be served."""
-
-    accepted_hits: int
-    accepted_misses: int
-    failed_hits: int
-    failed_misses: int
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Statistics:
     """Figures of all outcomes of an evaluation.
@@ -104,7 +95,7 @@ class Statistics:
         sigma: (6,) median over the hits of the standard deviation that the estimates claim; NaN where they claim none.
         solve_s: seconds per solve, all starts.
         evaluations: of the objective per solve, of the starts with an estimate.
-        verdicts: see `Verdicts`.
+        verdicts: starts by decision and truth.
         stop_reasons: why searches ended, by name.
     """
 
@@ -119,7 +110,7 @@ class Statistics:
     sigma: NDArray[np.float64]
     solve_s: SpreadStatistics
     evaluations: SpreadStatistics
-    verdicts: Verdicts
+    verdicts: VerdictCounts
     stop_reasons: dict[str, int]
 
     @property
@@ -204,7 +195,7 @@ def summarise(outcomes: Sequence[SolveOutcome]) -> Statistics:
         sigma=_claimed(hits),
         solve_s=spread(outcome.trial.solve_s for outcome in outcomes),
         evaluations=spread(float(estimate.optimum.evaluations) for estimate in estimates),
-        verdicts=Verdicts(
+        verdicts=VerdictCounts(
             accepted_hits=verdicts[True, True],
             accepted_misses=verdicts[True, False],
             failed_hits=verdicts[False, True],

@@ -59,7 +59,7 @@ def _train(arguments: argparse.Namespace) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    from coec_lab.training.onnx_export import export
+    from coec_lab.training.network import export
 
     export(arguments.checkpoint, arguments.network)
 

@@ -15,9 +15,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from coec_lab.training import training_frames
-from coec_lab.training.augment import augment
 from coec_lab.training.network import StreetNet
-from coec_lab.training.training_frames import SHAPES, TrainingFrame
+from coec_lab.training.training_frames import SHAPES, TrainingFrame, augment
 
 GRADIENT_WEIGHT, RANK_WEIGHT = 0.5, 0.5
 GRADIENT_SCALES = 4

@@ -30,7 +30,8 @@ from coec.config import CalibrationConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3
 from coec_lab.experiments import mount_steps
-from coec_lab.experiments.mount_steps import MountStep, MountStepRow, MountStepTrial, try_mount_steps
+from coec_lab.experiments.evaluation_schema import StepRow
+from coec_lab.experiments.mount_steps import MountStep, MountStepTrial, try_mount_steps
 from support.estimates import ESTIMATE_RIG, estimate
 
 CONFIG = CalibrationConfig()
@@ -140,11 +141,13 @@ def test_the_table_has_a_row_for_each_knock_in_their_order() -> None:
 
     reported = [one("none", accepted=True), one("1 deg", moved=True, off_s=1.0, interval_s=2.5, holds=True)]
     reported += [one("1 deg", accepted=True, wrong=True), one("1 deg, slowly", moved=True)]
-    assert mount_steps.table(reported) == (
-        MountStepRow("none", 1, 1.0, 0.0, 0.0, None, None, None, None),
-        MountStepRow("1 deg", 2, 0.5, 0.5, 0.5, 0.5, 1.0, 2.5, 1.0),
-        MountStepRow("1 deg, slowly", 1, 0.0, 0.0, 1.0, None, None, None, None),
-    )
+    names = tuple(StepRow.model_fields)
+    rows = [tuple(getattr(row, name) for name in names) for row in mount_steps.table(reported)]
+    assert rows == [
+        ("none", 1, 1.0, 0.0, 0.0, None, None, None, None),
+        ("1 deg", 2, 0.5, 0.5, 0.5, 0.5, 1.0, 2.5, 1.0),
+        ("1 deg, slowly", 1, 0.0, 0.0, 1.0, None, None, None, None),
+    ]
 
 
 def test_a_window_of_one_pair_has_no_time_for_a_knock(street: Window, monkeypatch: pytest.MonkeyPatch) -> None:

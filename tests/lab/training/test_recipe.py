@@ -10,8 +10,7 @@ pytest.importorskip("embreex", reason="needs embreex")
 from coec.geometry.projection import unproject
 from coec_lab.training import training_frames
 from coec_lab.training import training_scenes as recipe
-from coec_lab.training.augment import augment, target
-from coec_lab.training.training_frames import KINDS, NEAREST_M, SHAPES, SKY, UNKNOWN, TrainingFrame
+from coec_lab.training.training_frames import KINDS, NEAREST_M, SHAPES, SKY, UNKNOWN, TrainingFrame, augment, target
 from coec_lab.training.training_scenes import CROWDED, HallScene, JamScene, StreetScene, training_scenes
 
 

@@ -11,8 +11,7 @@ pytest.importorskip("onnx", reason="needs the extra `train` of coec-lab")
 import torch
 
 from coec_lab.training import training_frames
-from coec_lab.training.network import StreetNet
-from coec_lab.training.onnx_export import export, same
+from coec_lab.training.network import StreetNet, export, same
 from coec_lab.training.train import RATE, WARM_STEPS, loss, rate, train
 from coec_lab.training.training_frames import SHAPES, TrainingFrame
 

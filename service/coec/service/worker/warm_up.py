@@ -1,10 +1,19 @@
 """The warm-up of a worker: runs every kernel once on a few invented points, so that no work waits for a compiler. What
 a check needs comes first, because windows take longer to come. The kernels that a solve uses after its edges are
 extracted take half of the compiling time; `late_kernels` runs each of them on tiny inputs.
+
+If there is a second processor, a second process compiles kernels meanwhile, from those on that the warm-up needs last.
+Each finds the other's kernels in the cache on the disk, so they meet somewhere in the middle without dividing the work
+beforehand. It is started as `python -m coec.service.worker.warm_up PARENT`, with the configuration on its standard
+input.
 """
 
 import contextlib
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -14,8 +23,9 @@ from coec.calibration.monitor.check_verdict import MIN_PAIRS, diagnose
 from coec.calibration.objective.mutual_information import SearchBox
 from coec.calibration.pipeline import calibrate
 from coec.calibration.search.global_search import sample_reach
-from coec.config import CalibrationConfig
+from coec.config import CalibrationConfig, Config
 from coec.errors import CalibrationError, DecodeError
+from coec.geometry import compilation_events
 from coec.geometry.cameras import Camera, scaled
 from coec.geometry.edges import alignment
 from coec.geometry.edges.charts import charted_significances, edge_charts, pattern_search, select_separated
@@ -23,6 +33,7 @@ from coec.geometry.edges.displaced_alignment import DisplacedEdges, linearised
 from coec.geometry.mutual_information import BinnedFrames, information_of_each, mutual_information, share_of_pixels
 from coec.geometry.projection import project
 from coec.io.images import GreyImages, encode_jpeg
+from coec.service.worker.child_process import tie_to
 
 LATE_CAMERA_PX = 64
 """Longer side of the image: kernels are compiled for types, not for sizes."""
@@ -165,3 +176,49 @@ def invented_window(rig: types.Rig) -> types.Window:
         for stamp in range(0, MIN_PAIRS * 100_000_000, 100_000_000)
     )
     return types.Window("warm-up", rig, rig.T_camera_lidar_nominal, pairs)
+
+
+@contextmanager
+def second_compiler(config: Config) -> Iterator[None]:
+    """Within the block, the first kernel that has to be compiled starts the second process. If that process fails, the
+    worker only needs more time."""
+    children: list[subprocess.Popen[bytes]] = []
+
+    def on_compilation(_: str) -> None:
+        if not children and len(os.sched_getaffinity(0)) > 1:
+            children.append(_started(config))
+
+    try:
+        with compilation_events.listening(on_compilation):
+            yield
+    finally:
+        for child in children:
+            child.kill()
+            child.wait()
+
+
+def _started(config: Config) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", __name__, str(os.getpid())]
+    child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
+    assert child.stdin is not None
+    with contextlib.suppress(OSError), child.stdin:
+        child.stdin.write(config.model_dump_json().encode())
+    return child
+
+
+def main(arguments: list[str]) -> int:
+    """Compiles the kernels for one camera of each lens model."""
+    (parent,) = (int(argument) for argument in arguments)
+    tie_to(parent)
+    config = Config.model_validate_json(sys.stdin.buffer.read())
+    from coec.io.rig_files import rig_of
+
+    cameras = {type(camera): camera for camera in (rig_of(pair).camera for pair in config.pairs)}
+    for camera in cameras.values():
+        for run in late_kernels(camera):
+            run()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -53,8 +53,8 @@ def _serve(link: Link, config: Config) -> None:
     # Imported here because numba and onnxruntime take most of a second, and the process is tied to its parent before.
     # The imported objects stay for good: without `freeze`, looking through them for garbage took a tenth of the start.
     gc.disable()
-    from coec.service.worker.second_compiler import second_compiler
     from coec.service.worker.tasks import Solver, answer_request
+    from coec.service.worker.warm_up import second_compiler
 
     gc.freeze()
     gc.enable()
