@@ -108,10 +108,7 @@ def batch(
                 report = fleet_batch.run(inputs, terms, workers, output, on_row, resume=resume)
         finally:
             workers.close()
-    if as_json:
-        console.print_json(report.model_dump(mode="json"))
-    else:
-        _show(report, workers.cores)
+    console.report(report, lambda: _show(report, workers.cores), as_json=as_json)
     return 1 if report.errors else 0
 
 

@@ -80,10 +80,7 @@ def calibrate(
         except OutputError as error:
             not_written = error
             document["not_written"] = str(error)
-    if as_json:
-        console.print_json(document)
-    else:
-        _show(solution, document, intrinsics=intrinsics)
+    console.report(document, lambda: _show(solution, document, intrinsics=intrinsics), as_json=as_json)
     if manifest is not None and solution.mistake is not None:
         show_correction(manifest, solution.mistake, loaded.window.rig)
     elif solution.mistake is not None and solution.mistake.correctable and has_manifest(source):

@@ -65,10 +65,11 @@ def check(
     of_mistake = () if mistake is None else (Notice("fail", mistake.code, mistake.text),)
     every = (*of_mistake, *seen.remarks, *_of_trial(trial, seen, mistake))
     notes = tuple(sorted(every, key=lambda note: list(LEVEL_STYLES).index(note.level)))  # the most important first
-    if as_json:
-        console.print_json(_document(source, replace(seen, remarks=notes), trial, mistake))
-    else:
-        _show(recording.name, replace(seen, remarks=notes), trial)
+    console.report(
+        _document(source, replace(seen, remarks=notes), trial, mistake),
+        lambda: _show(recording.name, replace(seen, remarks=notes), trial),
+        as_json=as_json,
+    )
     if manifest is not None and mistake is not None:
         show_correction(manifest, mistake, recording.rig)
     return int(any(note.level == "fail" for note in notes))

@@ -37,10 +37,11 @@ def check_config(
     if defaults == (file is not None):
         raise UsageError("give a configuration file, or --defaults")
     if file is None:
-        if as_json:
-            console.print_json({"config": example().model_dump(mode="json")})
-        else:
-            console.show_lines(template().rstrip("\n"))
+        console.report(
+            {"config": example().model_dump(mode="json")},
+            lambda: console.show_lines(template().rstrip("\n")),
+            as_json=as_json,
+        )
         return 0
     config = load_config(file)
     checks = [check for pair in config.pairs for check in _check(pair, config)]

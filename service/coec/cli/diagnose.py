@@ -80,10 +80,7 @@ def diagnose(
     if output is not None:
         _write(output, seen, window, rigged, measured)
     finding = diagnosis.finding_of(seen, in_degrees(seen.offset).tolist(), in_degrees(seen.sigma).tolist(), measured)
-    if as_json:
-        console.print_json(_document(seen, finding, measured))
-    else:
-        _show(seen, finding)
+    console.report(_document(seen, finding, measured), lambda: _show(seen, finding), as_json=as_json)
     return int(finding.state != "right")
 
 

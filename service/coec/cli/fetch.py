@@ -115,7 +115,7 @@ def fetch(
         download = Download(session, keys, selected.pair, folder, timeout_s, patience_s, with_windows=not no_windows)
         report = download.fetch(selected.event_id)
     if as_json:
-        console.print_json(report.model_dump(mode="json"))
+        console.print_json(report)
     else:
         console.show(f"{folder / PAGE}  {incident_page.sentence(report)}")
         for absent in report.absent:

@@ -58,7 +58,7 @@ def report(
         page.write(output / "report.html", of_fleet)
         files.write_output(output / "report.json", to_json(summary))
     if as_json:
-        console.print_json(summary.model_dump(mode="json"))
+        console.print_json(summary)
         return 0
     _show(summary)
     if output is not None:

@@ -54,10 +54,9 @@ def lidars(
     error = None
     if recording.truth is not None:
         error = in_degrees(difference(edge.T_a_b, recording.truth(sweeps[len(sweeps) // 2].a.stamp_ns)))
-    if as_json:
-        console.print_json(_document(edge, error, time.monotonic() - started_s))
-    else:
-        _show(recording, edge, error)
+    console.report(
+        _document(edge, error, time.monotonic() - started_s), lambda: _show(recording, edge, error), as_json=as_json
+    )
     return 0 if not edge.reasons else 1
 
 

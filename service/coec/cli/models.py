@@ -33,10 +33,7 @@ def show(
     digest, identity = file_identity(file)
     card = find_card(file, digest)
     document = {"file": str(file), "sha256": digest, "identity": identity, "card": card.model_dump(mode="json")}
-    if as_json:
-        console.print_json(document)
-    else:
-        console.show_json(document)
+    console.report(document, lambda: console.show_json(document), as_json=as_json)
     return 0
 
 

@@ -438,10 +438,11 @@ def _save_picture(request: Request, way: RouterAddress, keys: Keys, path: Path, 
     if reply.encoding != JPEG:
         raise UsageError("the reply contains no picture: give --param overlay=before or overlay=after")
     files.replace_output(path, reply.payload)
-    if as_json:
-        console.print_json({"path": str(path), "size_bytes": len(reply.payload)})
-    else:
-        console.show(f"{path}  {len(reply.payload)} bytes")
+    console.report(
+        {"path": str(path), "size_bytes": len(reply.payload)},
+        lambda: console.show(f"{path}  {len(reply.payload)} bytes"),
+        as_json=as_json,
+    )
     return 0
 
 
@@ -466,10 +467,11 @@ def _download(
             bars.add_download(window_id),
             replaces=force,
         )
-    if as_json:
-        console.print_json({"path": str(output), **info.model_dump(mode="json")})
-    else:
-        console.show(f"{output}  {info.size_bytes} bytes, sha256 {info.sha256} verified")
+    console.report(
+        {"path": str(output), **info.model_dump(mode="json")},
+        lambda: console.show(f"{output}  {info.size_bytes} bytes, sha256 {info.sha256} verified"),
+        as_json=as_json,
+    )
     return 0
 
 

@@ -16,6 +16,7 @@ from contextlib import AbstractContextManager, nullcontext
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
+from pydantic import BaseModel
 from rich import progress as rich_progress
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.highlighter import JSONHighlighter
@@ -241,8 +242,19 @@ out = made(os.environ)
 err = made(os.environ, on_error=True)
 
 
+def report(document: Any, show: Callable[[], object], *, as_json: bool) -> None:
+    """Prints the outcome of a command: with `--json` as the one document, else for people, by `show`."""
+    if as_json:
+        print_json(document)
+    else:
+        show()
+
+
 def print_json(document: Any) -> None:
-    """The one document of `--json`: a line with sorted keys, floats in the shortest form that reads back exactly."""
+    """The one document of `--json`, a wire model or what JSON consists of: a line with sorted keys, floats in the
+    shortest form that reads back exactly."""
+    if isinstance(document, BaseModel):
+        document = document.model_dump(mode="json")
     escaped = not formatting.is_unicode(sys.stdout.encoding)
     text = json.dumps(document, sort_keys=True, separators=(",", ":"), ensure_ascii=escaped, allow_nan=False)
     formatting.write(f"{json_printable(text)}\n")

@@ -99,10 +99,7 @@ def run(*, as_json: bool) -> int:
     require_embree()
     with console.progress(counted=False) as bars:
         document = {"machine": _machine()} | kernels.measure(bars, kernels.Size()) | measure_processes(bars)
-    if as_json:
-        console.print_json(document)
-    else:
-        _show(document)
+    console.report(document, lambda: _show(document), as_json=as_json)
     return 0
 
 

@@ -40,8 +40,5 @@ def alarms(
     if output is not None:
         files.write_output(output / "alarms.json", to_json(report))
         files.write_output(output / "delay.png", alarm_statistics.delay_curve(report))
-    if as_json:
-        console.print_json(report.model_dump(mode="json"))
-    else:
-        alarm_statistics.show(report)
+    console.report(report, lambda: alarm_statistics.show(report), as_json=as_json)
     return 0

@@ -72,10 +72,7 @@ def assess(
     report = _report((model, source), window, depth.identity, quality, timed_ms, elapsed_s)
     if output is not None:
         files.write_output(output / "report.json", to_json(report))
-    if as_json:
-        console.print_json(report.model_dump(mode="json"))
-    else:
-        _show(report)
+    console.report(report, lambda: _show(report), as_json=as_json)
     return 1 if report.suitability == "do_not_use" else 0
 
 

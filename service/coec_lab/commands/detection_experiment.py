@@ -49,7 +49,8 @@ def show(report: DetectionReport, source: str, output: Path | None, *, as_json: 
 
     if output is not None:
         page.write(output / "report.html", detection_page(report, source, Provenance.here()))
-    if as_json:
-        console.print_json({"source": source, **report.model_dump(mode="json")})
-    else:
-        evaluation_tables.show_detection(report)
+    console.report(
+        {"source": source, **report.model_dump(mode="json")},
+        lambda: evaluation_tables.show_detection(report),
+        as_json=as_json,
+    )

@@ -104,10 +104,11 @@ def write_pair(options: DriveOptions, output: Path, *, force: bool, as_json: boo
         with suppress(OSError):
             part.unlink(missing_ok=True)
     size = output.stat().st_size
-    if as_json:
-        console.print_json({"written": str(output), "bytes": size, "frames": pictures})
-    else:
-        console.show(f"{output}  {count(pictures, 'picture')}  {size} bytes")
+    console.report(
+        {"written": str(output), "bytes": size, "frames": pictures},
+        lambda: console.show(f"{output}  {count(pictures, 'picture')}  {size} bytes"),
+        as_json=as_json,
+    )
     return 0
 
 
@@ -125,10 +126,7 @@ def write_picture(options: DriveOptions, at_s: float, output: Path, *, as_json: 
     index = min(round(at_s * options.camera_hz), len(simulated.camera_stamps_ns) - 1)
     frame = next(frame for frame in simulated.messages([index]) if isinstance(frame, CameraFrame))
     path = write_output(output, frame.image.data)
-    if as_json:
-        console.print_json({"written": str(path)})
-    else:
-        console.show(str(path))
+    console.report({"written": str(path)}, lambda: console.show(str(path)), as_json=as_json)
     return 0
 
 

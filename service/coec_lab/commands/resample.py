@@ -65,8 +65,5 @@ def resample(
             rows.append(statistics.row_of(of, reference, solves))
             lenses += statistics.lens_rows(of, solves) if lens_errors else []
     report = statistics.ResampleReport(seed=seed, rows=tuple(rows), lenses=tuple(lenses))
-    if as_json:
-        console.print_json(report.model_dump(mode="json"))
-    else:
-        statistics.show(report)
+    console.report(report, lambda: statistics.show(report), as_json=as_json)
     return 0

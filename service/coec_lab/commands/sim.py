@@ -60,10 +60,7 @@ def rig_drives(
             bars.update(task, advance=1, note=row.name)
     report = rig_drive_statistics.report([rows[name] for name in names], camera)
     user_files.write_output(output / "report.json", to_json(report))
-    if as_json:
-        console.print_json(report.model_dump(mode="json"))
-    else:
-        rig_moves.show_drives(report)
+    console.report(report, lambda: rig_moves.show_drives(report), as_json=as_json)
     return 0
 
 
@@ -83,10 +80,7 @@ def rig_moves(
     with console.progress() as bars:
         task = bars.add_task("drives", total=len(rig_moves.FAULTS) * drives, note="")
         report = rig_moves.report(drives, rigs, lambda note: bars.update(task, advance=1, note=note))
-    if as_json:
-        console.print_json(report.model_dump(mode="json"))
-    else:
-        rig_moves.show(report)
+    console.report(report, lambda: rig_moves.show(report), as_json=as_json)
     return 0
 
 
@@ -151,10 +145,7 @@ def matrix(
     report = matrix_statistics.report([rows[name] for name in names])
     user_files.write_output(output / "report.json", to_json(report))
     user_files.write_output(output / "normalised.png", plots.matrix_errors(report))
-    if as_json:
-        console.print_json(report.model_dump(mode="json"))
-    else:
-        matrix_statistics.show(report)
+    console.report(report, lambda: matrix_statistics.show(report), as_json=as_json)
     return 0
 
 
@@ -237,10 +228,7 @@ def checks(
                 bars.update(task, advance=1, note=row.name)
     report = check_statistics.report([rows[name] for name in names], hours)
     user_files.write_output(output / "report.json", to_json(report))
-    if as_json:
-        console.print_json(report.model_dump(mode="json"))
-    else:
-        check_statistics.show(report)
+    console.report(report, lambda: check_statistics.show(report), as_json=as_json)
     return 0
 
 

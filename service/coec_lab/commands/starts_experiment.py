@@ -79,7 +79,7 @@ def run(request: EvaluationRequest, folder: Path | None, *, as_json: bool) -> in
             of_method = _evaluate(request.plan, choices, subject, folder, stages)
             document, make_page = of_method.report, of_method.page
     if as_json:
-        console.print_json(document.model_dump(mode="json"))
+        console.print_json(document)
     elif isinstance(document, ComparisonReport):
         evaluation_tables.show_comparison(document)
     else:

@@ -101,10 +101,11 @@ def run(output: Path, *, as_json: bool) -> int:
                 window, accused = _fetch(observer, snapshot, output)
             daemon.end()
             left = pair_report.write(output, picture, window, accused, observer, snapshot, outcome)
-    if as_json:
-        console.print_json(_document(observer, outcome, left, started_s))
-    else:
-        pair_report.show(observer.timeline, outcome, left)
+    console.report(
+        _document(observer, outcome, left, started_s),
+        lambda: pair_report.show(observer.timeline, outcome, left),
+        as_json=as_json,
+    )
     return 0 if outcome.passed else 1
 
 

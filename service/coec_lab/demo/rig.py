@@ -392,10 +392,11 @@ def run(output: Path, *, as_json: bool, scenario: Scenario = SCENARIO) -> int:
             bars.update(task, completed=len(acts) * len(vehicle.plan))
         as_built = vehicle.as_built
     files = write(output, as_built, acts, scenario)
-    if as_json:
-        console.print_json(document(acts, files, time.monotonic() - started_s, scenario))
-    else:
-        show(acts, files, scenario)
+    console.report(
+        document(acts, files, time.monotonic() - started_s, scenario),
+        lambda: show(acts, files, scenario),
+        as_json=as_json,
+    )
     return 0 if all(outcome.passed for outcome, _ in acts) else 1
 
 

@@ -224,10 +224,7 @@ def run(request: ClosureRequest, folder: Path | None, *, as_json: bool) -> int:
         of_frames = {f"closure on {closure.frames.value}": closure.normalised for closure in closures}
         evaluation_pictures.write_normalised(folder, name, of_frames)
         user_files.write_output(folder / "report.json", to_json(document))
-    if as_json:
-        console.print_json(document.model_dump(mode="json"))
-    else:
-        evaluation_tables.show_closure(document)
+    console.report(document, lambda: evaluation_tables.show_closure(document), as_json=as_json)
     return 0
 
 

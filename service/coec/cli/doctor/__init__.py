@@ -53,7 +53,7 @@ def doctor(
             _show(finding)
     report = DoctorReport(healthy=all(one.level != "fail" for one in findings), findings=tuple(findings))
     if as_json:
-        console.print_json(report.model_dump(mode="json"))
+        console.print_json(report)
     else:
         counts = {level: sum(one.level == level for one in findings) for level in STYLES}
         console.show(", ".join(f"{count} {level}" for level, count in counts.items()), "bold")

@@ -73,10 +73,11 @@ def show_fleet(
                 while not heartbeats.initial_query_done.wait(FRAME_S) and not stop.is_set():
                     pass
                 fleet = board.once()
-                if as_json:
-                    console.print_json(fleet.model_dump(mode="json"))
-                else:
-                    console.out.print(fleet_board.board(fleet, -1, 0, fleet.matching, ""))
+                console.report(
+                    fleet,
+                    lambda: console.out.print(fleet_board.board(fleet, -1, 0, fleet.matching, "")),
+                    as_json=as_json,
+                )
                 return 0 if fleet.known else 1
             with (
                 board.query,

@@ -7,13 +7,22 @@ these declarations.
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from itertools import accumulate
 from typing import Literal, get_args
 
 from coec.calibration.state_machine import HealthState
-from coec.schemas.replies import BudgetStatus, CheckReply, HealthReply, Maybe6, PairStatus, StatusReply, StreamStatus
+from coec.schemas.replies import (
+    BudgetStatus,
+    CheckReply,
+    HealthReply,
+    Maybe6,
+    MetricReply,
+    PairStatus,
+    StatusReply,
+    StreamStatus,
+)
 from coec.schemas.rig_state import RigReply, SensorState
 from coec.service.api.reply_builders import AXES, UNITS
 from coec.service.api.uplink import Uplink
@@ -33,8 +42,10 @@ class TextFormat(Enum):
     `info` and `stateset`, which become gauges, and its families carry the names of their samples."""
 
 
-MetricSample = tuple[tuple[str, ...], float]
-"""Values of a family's labels in their order, and the value of the sample."""
+Kind = Literal["counter", "gauge", "histogram", "info", "stateset"]
+
+MetricSample = tuple[tuple[str, ...], float | None]
+"""Values of a family's labels in their order, and the value of the sample; None: there is no such sample."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +84,7 @@ class Family:
     """One metric family. `samples` is empty for histograms, whose figures are in `View.took`."""
 
     name: str
-    kind: Literal["counter", "gauge", "histogram", "info", "stateset"]
+    kind: Kind
     help: str
     labels: tuple[str, ...] = ()
     samples: Callable[[MetricsInput], Iterable[MetricSample]] = lambda _: ()
@@ -103,7 +114,8 @@ class Family:
             yield from self._buckets(view)
             return
         for values, value in self.samples(view):
-            yield f"{self.name}{self.suffix}{_braces(self.labels, values)} {_number(value)}"
+            if value is not None:
+                yield f"{self.name}{self.suffix}{_braces(self.labels, values)} {_number(float(value))}"
 
     def _buckets(self, view: MetricsInput) -> Iterable[str]:
         for labelled in view.durations.get(self.name, ()):
@@ -128,83 +140,92 @@ def render(view: MetricsInput, text_format: TextFormat = TextFormat.OPEN_METRICS
 # --- samples --------------------------------------------------------------------------------------------------------
 
 
-def _one(value: Callable[[MetricsInput], float | None]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
-    def samples(view: MetricsInput) -> Iterable[MetricSample]:
-        number = value(view)
-        return () if number is None else (((), float(number)),)
-
-    return samples
+def _single(name: str, text: str, value: Callable[[MetricsInput], float | None], kind: Kind = "gauge") -> Family:
+    return Family(name, kind, text, (), lambda view: (((), value(view)),))
 
 
-def _per_pair(value: Callable[[PairStatus], float]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
-    return lambda view: (((pair.name,), float(value(pair))) for pair in view.status.pairs)
+def _labelled(
+    name: str,
+    text: str,
+    label: str,
+    values: Callable[[MetricsInput], Mapping[str, float] | Mapping[str, float | None]],
+    kind: Kind = "counter",
+) -> Family:
+    return Family(name, kind, text, (label,), lambda view: (((key,), value) for key, value in values(view).items()))
 
 
-def _counts(counts: Callable[[PairStatus], Mapping[str, int]]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
-    return lambda view: (
-        ((pair.name, name), float(count)) for pair in view.status.pairs for name, count in counts(pair).items()
+def _of_uplink(name: str, text: str, counts: Callable[[Uplink], Mapping[str, int]]) -> Family:
+    return _labelled(
+        name, text, "resource", lambda view: {} if view.uplink is None else dict(sorted(counts(view.uplink).items()))
     )
 
 
-def _of_worker(counts: Callable[[MetricsInput], Mapping[str, int]]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
-    return lambda view: (((name,), float(count)) for name, count in counts(view).items())
+def _of_budget(name: str, text: str, value: Callable[[BudgetStatus], float]) -> Family:
+    return _single(name, text, lambda view: None if view.status.budget is None else value(view.status.budget))
 
 
-def _of_uplink(counts: Callable[[Uplink], Mapping[str, int]]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
-    return lambda view: (
-        ()
-        if view.uplink is None
-        else tuple(((resource,), float(count)) for resource, count in sorted(counts(view.uplink).items()))
+def _of_pair(name: str, text: str, value: Callable[[PairStatus], float], kind: Kind = "counter") -> Family:
+    return Family(name, kind, text, ("pair",), lambda view: (((one.name,), value(one)) for one in view.status.pairs))
+
+
+def _counts_of_pair(name: str, text: str, label: str, counts: Callable[[PairStatus], Mapping[str, int]]) -> Family:
+    return Family(
+        name,
+        "counter",
+        text,
+        ("pair", label),
+        lambda view: (((one.name, key), count) for one in view.status.pairs for key, count in counts(one).items()),
     )
 
 
-def _of_budget(
-    figures: Callable[[BudgetStatus], Mapping[tuple[str, ...], float | None]],
-) -> Callable[[MetricsInput], Iterable[MetricSample]]:
-    def samples(view: MetricsInput) -> Iterable[MetricSample]:
-        if view.status.budget is not None:
-            for labels, number in figures(view.status.budget).items():
-                if number is not None:
-                    yield labels, float(number)
-
-    return samples
-
-
-def _streams(value: Callable[[StreamStatus], float | None]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
+def _of_stream(name: str, text: str, value: Callable[[StreamStatus], float | None], kind: Kind = "counter") -> Family:
     def samples(view: MetricsInput) -> Iterable[MetricSample]:
         for pair in view.status.pairs:
-            for name, stream in (("camera", pair.camera), ("lidar", pair.lidar), ("ego", pair.ego)):
-                number = None if stream is None else value(stream)
-                if number is not None:
-                    yield (pair.name, name), float(number)
+            for stream, status in (("camera", pair.camera), ("lidar", pair.lidar), ("ego", pair.ego)):
+                yield (pair.name, stream), None if status is None else value(status)
 
-    return samples
+    return Family(name, kind, text, ("pair", "stream"), samples)
 
 
-def _version(view: MetricsInput) -> Iterable[MetricSample]:
-    yield (view.status.version,), 1.0
+def _of_health(name: str, text: str, value: Callable[[HealthReply], float | None], kind: Kind = "gauge") -> Family:
+    return Family(
+        name, kind, text, ("pair",), lambda view: (((pair,), value(reply)) for pair, reply in view.health.items())
+    )
+
+
+def _axes(choose: Callable[[HealthReply], Maybe6 | None], view: MetricsInput) -> Iterable[MetricSample]:
+    """Samples by pair, axis and unit."""
+    for pair, reply in view.health.items():
+        for axis, unit, value in zip(AXES, UNITS, choose(reply) or (), strict=False):
+            yield (pair, axis, unit), value
+
+
+def _of_axis(name: str, text: str, choose: Callable[[HealthReply], Maybe6 | None]) -> Family:
+    return Family(name, "gauge", text, ("pair", "axis", "unit"), lambda view: _axes(choose, view))
+
+
+def _of_check(name: str, text: str, choose: Callable[[CheckReply], Maybe6 | None]) -> Family:
+    return _of_axis(name, text, lambda reply: None if reply.check is None else choose(reply.check))
+
+
+def _derivative(name: str, text: str, choose: Callable[[CheckReply], Maybe6]) -> Family:
+    """Samples by pair and axis, without the unit, which the help line names."""
+    by_unit = _of_check(name, text, choose)
+    return replace(
+        by_unit, labels=("pair", "axis"), samples=lambda view: ((of[:2], value) for of, value in by_unit.samples(view))
+    )
 
 
 def _states(view: MetricsInput) -> Iterable[MetricSample]:
     for pair, reply in view.health.items():
         for state in HealthState:
-            yield (pair, state.value), float(state == reply.state)
+            yield (pair, state.value), state == reply.state
 
 
 def _sensor_states(view: MetricsInput) -> Iterable[MetricSample]:
     for sensor in () if view.rig is None else view.rig.sensors:
         for state in get_args(SensorState):
-            yield (sensor.name, state), float(state == sensor.state)
-
-
-def _of_rig(
-    value: Callable[[RigReply], Mapping[tuple[str, ...], float | None]],
-) -> Callable[[MetricsInput], Iterable[MetricSample]]:
-    def samples(view: MetricsInput) -> Iterable[MetricSample]:
-        numbers = {} if view.rig is None else value(view.rig)
-        return tuple((labels, float(figure)) for labels, figure in numbers.items() if figure is not None)
-
-    return samples
+            yield (sensor.name, state), state == sensor.state
 
 
 def _reasons(view: MetricsInput) -> Iterable[MetricSample]:
@@ -216,51 +237,17 @@ def _reasons(view: MetricsInput) -> Iterable[MetricSample]:
 def _alarms(view: MetricsInput) -> Iterable[MetricSample]:
     for pair, reply in view.health.items():
         if reply.alarms is not None:
-            yield (pair, "confirmed"), float(reply.alarms.confirmed)
-            yield (pair, "withdrawn"), float(reply.alarms.withdrawn)
+            yield (pair, "confirmed"), reply.alarms.confirmed
+            yield (pair, "withdrawn"), reply.alarms.withdrawn
 
 
-def _of_health(value: Callable[[HealthReply], float | None]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
+def _figures(name: str, text: str, value: Callable[[MetricReply], float | None]) -> Family:
     def samples(view: MetricsInput) -> Iterable[MetricSample]:
         for pair, reply in view.health.items():
-            number = value(reply)
-            if number is not None:
-                yield (pair,), number
+            for figure, metric in sorted(reply.metrics.items()):
+                yield (pair, figure), value(metric)
 
-    return samples
-
-
-def _figures(which: Literal["value", "limit"]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
-    def samples(view: MetricsInput) -> Iterable[MetricSample]:
-        for pair, reply in view.health.items():
-            for name, metric in sorted(reply.metrics.items()):
-                number = metric.value if which == "value" else metric.limit
-                if number is not None:
-                    yield (pair, name), number
-
-    return samples
-
-
-def _axes(choose: Callable[[HealthReply], Maybe6 | None]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
-    """Samples by pair, axis and unit, without unknown values."""
-
-    def samples(view: MetricsInput) -> Iterable[MetricSample]:
-        for pair, reply in view.health.items():
-            for axis, unit, value in zip(AXES, UNITS, choose(reply) or (), strict=False):
-                if value is not None:
-                    yield (pair, axis, unit), value
-
-    return samples
-
-
-def _check_axes(choose: Callable[[CheckReply], Maybe6 | None]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
-    return _axes(lambda reply: None if reply.check is None else choose(reply.check))
-
-
-def _derivatives(choose: Callable[[CheckReply], Maybe6]) -> Callable[[MetricsInput], Iterable[MetricSample]]:
-    """Samples by pair and axis, without the unit, which the help line names."""
-    by_unit = _check_axes(choose)
-    return lambda view: (((pair, axis), value) for (pair, axis, _), value in by_unit(view))
+    return Family(name, "gauge", text, ("pair", "metric"), samples)
 
 
 def _losses(view: MetricsInput) -> Iterable[MetricSample]:
@@ -274,12 +261,24 @@ def _losses(view: MetricsInput) -> Iterable[MetricSample]:
         }
         for place, causes in places.items():
             for cause, count in causes.items():
-                yield (pair.name, place, cause), float(count)
+                yield (pair.name, place, cause), count
 
 
-def _job_age(view: MetricsInput) -> Iterable[MetricSample]:
-    worker = view.status.worker
-    return () if worker.job_age_s is None else (((worker.job or "",), worker.job_age_s),)
+def _sensor_probabilities(view: MetricsInput) -> Mapping[str, float | None]:
+    return {} if view.rig is None else {sensor.name: sensor.probability for sensor in view.rig.sensors}
+
+
+def _rig_p_value(view: MetricsInput) -> float | None:
+    return None if view.rig is None or view.rig.joint is None else view.rig.joint.p_value
+
+
+def _job_age(view: MetricsInput) -> Mapping[str, float | None]:
+    return {view.status.worker.job or "": view.status.worker.job_age_s}
+
+
+def _unseen(view: MetricsInput) -> Mapping[str, float | None]:
+    budget = view.status.budget
+    return {} if budget is None else {name: share.unseen_s for name, share in budget.pairs.items()}
 
 
 # --- text -----------------------------------------------------------------------------------------------------------
@@ -305,234 +304,122 @@ QUERY, DECODE, PAIR_WAIT = "coec_query_seconds", "coec_decode_seconds", "coec_pa
 WRITE, JOB, WORK = "coec_write_seconds", "coec_worker_job_seconds", "coec_worker_work_seconds"
 """Names of the histograms; the keys of `View.took`."""
 
-_PAIR, _STREAM, _AXIS = ("pair",), ("pair", "stream"), ("pair", "axis", "unit")
-
 FAMILIES: tuple[Family, ...] = (
-    Family(
-        "coec_build", "info", "Version of the service.", ("version",), lambda view: (((view.status.version,), 1.0),)
-    ),
-    Family("coec_uptime_seconds", "gauge", "Time since the start.", (), _one(lambda view: view.status.uptime_s)),
-    Family("coec_memory_bytes", "gauge", "Resident memory of the service.", (), _one(lambda view: view.memory_bytes)),
+    Family("coec_build", "info", "Version of the service.", ("version",), lambda view: (((view.status.version,), 1),)),
+    _single("coec_uptime_seconds", "Time since the start.", lambda view: view.status.uptime_s),
+    _single("coec_memory_bytes", "Resident memory of the service.", lambda view: view.memory_bytes),
     Family("coec_health", "stateset", "State of each pair.", ("pair", "coec_health"), _states),
     Family("coec_sensor", "stateset", "State of each sensor.", ("sensor", "coec_sensor"), _sensor_states),
-    Family(
+    _labelled(
         "coec_sensor_moved_probability",
-        "gauge",
         "Probability that a sensor has moved.",
-        ("sensor",),
-        _of_rig(lambda rig: {(sensor.name,): sensor.probability for sensor in rig.sensors}),
-    ),
-    Family(
-        "coec_rig_p_value",
+        "sensor",
+        _sensor_probabilities,
         "gauge",
-        "Chance that pairs which fit each other miss each other by so much.",
-        (),
-        _of_rig(lambda rig: {(): None if rig.joint is None else rig.joint.p_value}),
     ),
-    Family(
+    _single("coec_rig_p_value", "Chance that pairs which fit each other miss each other by so much.", _rig_p_value),
+    _labelled(
         "coec_rig_losses",
-        "counter",
         "What pairs said and was not put together in its order, by cause.",
-        ("cause",),
-        _of_rig(lambda rig: {(cause,): count for cause, count in rig.losses.items()}),
+        "cause",
+        lambda view: {} if view.rig is None else view.rig.losses,
     ),
     Family("coec_reason", "gauge", "1 for each reason that health gives, by its code.", ("pair", "code"), _reasons),
-    Family(
-        "coec_check_age_seconds", "gauge", "Time since data were last judged.", _PAIR, _of_health(lambda one: one.age_s)
+    _of_health("coec_check_age_seconds", "Time since data were last judged.", lambda one: one.age_s),
+    _figures("coec_diagnosis", "Figures of self-diagnosis.", lambda metric: metric.value),
+    _figures("coec_diagnosis_limit", "Their limits.", lambda metric: metric.limit),
+    _of_check("coec_check_offset", "From the pose to the local optimum.", lambda check: check.offset),
+    _of_check("coec_check_offset_sigma", "Its standard deviation.", lambda check: check.sigma),
+    _of_check("coec_check_drift", "Local optimum from commissioned.", lambda check: check.drift),
+    _of_check("coec_check_drift_sigma", "Its standard deviation.", lambda check: check.drift_sigma),
+    _of_axis("coec_drift", "Served from commissioned.", lambda one: one.drift),
+    _of_axis("coec_drift_sigma", "Its standard deviation.", lambda one: one.drift_sigma),
+    _of_axis("coec_result_drift", "Last window from commissioned.", lambda one: one.result_drift),
+    _of_axis("coec_result_drift_sigma", "Its deviation.", lambda one: one.result_drift_sigma),
+    _derivative(
+        "coec_mi_first_derivative", "Nats per rad or m, at what is served.", lambda check: check.first_derivative
     ),
-    Family("coec_diagnosis", "gauge", "Figures of self-diagnosis.", ("pair", "metric"), _figures("value")),
-    Family("coec_diagnosis_limit", "gauge", "Their limits.", ("pair", "metric"), _figures("limit")),
-    Family(
-        "coec_check_offset",
-        "gauge",
-        "From the pose to the local optimum.",
-        _AXIS,
-        _check_axes(lambda check: check.offset),
-    ),
-    Family(
-        "coec_check_offset_sigma",
-        "gauge",
-        "Its standard deviation.",
-        _AXIS,
-        _check_axes(lambda check: check.sigma),
-    ),
-    Family(
-        "coec_check_drift",
-        "gauge",
-        "Local optimum from commissioned.",
-        _AXIS,
-        _check_axes(lambda check: check.drift),
-    ),
-    Family(
-        "coec_check_drift_sigma",
-        "gauge",
-        "Its standard deviation.",
-        _AXIS,
-        _check_axes(lambda check: check.drift_sigma),
-    ),
-    Family("coec_drift", "gauge", "Served from commissioned.", _AXIS, _axes(lambda one: one.drift)),
-    Family("coec_drift_sigma", "gauge", "Its standard deviation.", _AXIS, _axes(lambda one: one.drift_sigma)),
-    Family("coec_result_drift", "gauge", "Last window from commissioned.", _AXIS, _axes(lambda one: one.result_drift)),
-    Family("coec_result_drift_sigma", "gauge", "Its deviation.", _AXIS, _axes(lambda one: one.result_drift_sigma)),
-    Family(
-        "coec_mi_first_derivative",
-        "gauge",
-        "Nats per rad or m, at what is served.",
-        ("pair", "axis"),
-        _derivatives(lambda check: check.first_derivative),
-    ),
-    Family(
+    _derivative(
         "coec_mi_second_derivative",
-        "gauge",
         "Negative, nats per rad2 or m2, at what is served.",
-        ("pair", "axis"),
-        _derivatives(lambda check: check.second_derivative),
+        lambda check: check.second_derivative,
     ),
-    Family("coec_samples_received", "counter", "Samples that came.", _STREAM, _streams(lambda one: one.received)),
-    Family("coec_samples_waiting", "gauge", "Samples not decoded yet.", _STREAM, _streams(lambda one: one.waiting)),
-    Family(
-        "coec_sample_age_seconds", "gauge", "Time since the last sample came.", _STREAM, _streams(lambda one: one.age_s)
-    ),
-    Family("coec_frames_accepted", "counter", "Frames made of samples.", _STREAM, _streams(lambda one: one.accepted)),
+    _of_stream("coec_samples_received", "Samples that came.", lambda one: one.received),
+    _of_stream("coec_samples_waiting", "Samples not decoded yet.", lambda one: one.waiting, "gauge"),
+    _of_stream("coec_sample_age_seconds", "Time since the last sample came.", lambda one: one.age_s, "gauge"),
+    _of_stream("coec_frames_accepted", "Frames made of samples.", lambda one: one.accepted),
     Family("coec_losses", "counter", "What was lost, by cause.", ("pair", "place", "cause"), _losses),
-    Family("coec_pairs", "counter", "Camera-LiDAR pairs formed.", _PAIR, _per_pair(lambda one: one.pairs)),
-    Family("coec_pairs_held", "gauge", "Pairs that wait for an answer.", _PAIR, _per_pair(lambda one: one.held)),
-    Family("coec_window_pairs", "gauge", "Pairs in the open window.", _PAIR, _per_pair(lambda one: one.selected)),
-    Family(
-        "coec_pairs_unwritten", "gauge", "Pairs that wait for the disk.", _PAIR, _per_pair(lambda one: one.unwritten)
-    ),
-    Family("coec_windows_recorded", "counter", "Windows recorded.", _PAIR, _per_pair(lambda one: one.windows)),
-    Family("coec_windows_evaluated", "counter", "Windows evaluated.", _PAIR, _per_pair(lambda one: one.solved)),
-    Family("coec_checks", "counter", "Checks of the monitor.", _PAIR, _per_pair(lambda one: one.checks)),
-    Family("coec_health_changes", "counter", "States entered.", ("pair", "to"), _counts(lambda one: one.transitions)),
-    Family(
+    _of_pair("coec_pairs", "Camera-LiDAR pairs formed.", lambda one: one.pairs),
+    _of_pair("coec_pairs_held", "Pairs that wait for an answer.", lambda one: one.held, "gauge"),
+    _of_pair("coec_window_pairs", "Pairs in the open window.", lambda one: one.selected, "gauge"),
+    _of_pair("coec_pairs_unwritten", "Pairs that wait for the disk.", lambda one: one.unwritten, "gauge"),
+    _of_pair("coec_windows_recorded", "Windows recorded.", lambda one: one.windows),
+    _of_pair("coec_windows_evaluated", "Windows evaluated.", lambda one: one.solved),
+    _of_pair("coec_checks", "Checks of the monitor.", lambda one: one.checks),
+    _counts_of_pair("coec_health_changes", "States entered.", "to", lambda one: one.transitions),
+    _of_health(
         "coec_watched_seconds",
-        "counter",
         "Sensor time between completed checks.",
-        _PAIR,
-        _of_health(lambda one: None if one.alarms is None else one.alarms.watched_s),
+        lambda one: None if one.alarms is None else one.alarms.watched_s,
+        "counter",
     ),
     Family("coec_alarms", "counter", "Alarms that ended; `withdrawn`: false ones.", ("pair", "outcome"), _alarms),
-    Family("coec_commands", "counter", "Commands, by outcome.", ("pair", "command"), _counts(lambda one: one.commands)),
+    _counts_of_pair("coec_commands", "Commands, by outcome.", "command", lambda one: one.commands),
     Family(QUERY, "histogram", "From a query to its answer or refusal, by what was asked for.", ("resource",)),
-    Family(
+    _labelled(
         "coec_queries_waiting",
-        "gauge",
         "Queries that wait: `commands`, `files` for the disk, `drawing` for a picture.",
-        ("queue",),
-        _of_worker(lambda view: view.status.queries_waiting),
+        "queue",
+        lambda view: view.status.queries_waiting,
+        "gauge",
     ),
-    Family(
-        "coec_uplink_bytes",
-        "counter",
-        "Evidence that went out, by what was asked for.",
-        ("resource",),
-        _of_uplink(lambda uplink: uplink.sent),
-    ),
-    Family(
-        "coec_uplink_refused",
-        "counter",
-        "Answers that had to wait for the uplink.",
-        ("resource",),
-        _of_uplink(lambda uplink: uplink.refused),
-    ),
+    _of_uplink("coec_uplink_bytes", "Evidence that went out, by what was asked for.", lambda uplink: uplink.sent),
+    _of_uplink("coec_uplink_refused", "Answers that had to wait for the uplink.", lambda uplink: uplink.refused),
     Family(DECODE, "histogram", "Decoding of a sample, once for all pairs.", ("sensor", "stream")),
-    Family(PAIR_WAIT, "histogram", "From a pair's last frame until it is looked at.", _PAIR),
-    Family(WRITE, "histogram", "Writing of a pair into its window.", _PAIR),
+    Family(PAIR_WAIT, "histogram", "From a pair's last frame until it is looked at.", ("pair",)),
+    Family(WRITE, "histogram", "Writing of a pair into its window.", ("pair",)),
     Family(JOB, "histogram", "From a question to the worker to its result, by kind: check, solve, ...", ("kind",)),
     Family(WORK, "histogram", "Time that the worker itself needed for a job, by kind.", ("kind",)),
-    Family(
-        "coec_worker_jobs",
-        "counter",
-        "Jobs that have ended, by fate.",
-        ("fate",),
-        _of_worker(lambda view: view.status.worker.outcomes),
+    _labelled("coec_worker_jobs", "Jobs that have ended, by fate.", "fate", lambda view: view.status.worker.outcomes),
+    _labelled(
+        "coec_worker_losses", "Jobs without a result, by cause.", "cause", lambda view: view.status.worker.losses
     ),
-    Family(
-        "coec_worker_losses",
-        "counter",
-        "Jobs without a result, by cause.",
-        ("cause",),
-        _of_worker(lambda view: view.status.worker.losses),
+    _labelled("coec_worker_faults", "Processes replaced, by cause.", "cause", lambda view: view.status.worker.faults),
+    _labelled(
+        "coec_worker_waiting", "Jobs that wait, by kind.", "kind", lambda view: view.status.worker.waiting, "gauge"
     ),
-    Family(
-        "coec_worker_faults",
-        "counter",
-        "Processes replaced, by cause.",
-        ("cause",),
-        _of_worker(lambda view: view.status.worker.faults),
-    ),
-    Family(
-        "coec_worker_waiting",
-        "gauge",
-        "Jobs that wait, by kind.",
-        ("kind",),
-        _of_worker(lambda view: view.status.worker.waiting),
-    ),
-    Family("coec_worker_job_age_seconds", "gauge", "Age of the job that the worker has.", ("kind",), _job_age),
-    Family("coec_worker_restarts", "counter", "Workers replaced.", (), _one(lambda view: view.status.worker.restarts)),
-    Family(
+    _labelled("coec_worker_job_age_seconds", "Age of the job that the worker has.", "kind", _job_age, "gauge"),
+    _single("coec_worker_restarts", "Workers replaced.", lambda view: view.status.worker.restarts, "counter"),
+    _labelled(
         "coec_worker_processor_seconds",
-        "counter",
         "Processor time of the worker, by what for: check, solve, ...",
-        ("kind",),
-        _of_budget(lambda budget: {(kind,): cpu_s for kind, cpu_s in budget.spent_s.items()}),
+        "kind",
+        lambda view: {} if view.status.budget is None else view.status.budget.spent_s,
     ),
-    Family(
-        "coec_budget_cores", "gauge", "What the worker may spend.", (), _of_budget(lambda budget: {(): budget.cores})
+    _of_budget("coec_budget_cores", "What the worker may spend.", lambda budget: budget.cores),
+    _of_budget(
+        "coec_budget_spent_cores", "What the worker took in the last three minutes.", lambda budget: budget.spent
     ),
-    Family(
-        "coec_budget_spent_cores",
-        "gauge",
-        "What the worker took in the last three minutes.",
-        (),
-        _of_budget(lambda budget: {(): budget.spent}),
+    _of_budget(
+        "coec_budget_wanted_cores", "What every check and every window would take.", lambda budget: budget.wanted
     ),
-    Family(
-        "coec_budget_wanted_cores",
-        "gauge",
-        "What every check and every window would take.",
-        (),
-        _of_budget(lambda budget: {(): budget.wanted}),
-    ),
-    Family(
+    _of_budget(
         "coec_budget_stretch",
-        "gauge",
         "Periods and slices are so many times as long as configured.",
-        (),
-        _of_budget(lambda budget: {(): budget.stretched_by}),
+        lambda budget: budget.stretched_by,
     ),
-    Family(
-        "coec_budget_store_seconds",
-        "gauge",
-        "Processor time in store; below 0: borrowed.",
-        (),
-        _of_budget(lambda budget: {(): budget.in_store_s}),
+    _of_budget(
+        "coec_budget_store_seconds", "Processor time in store; below 0: borrowed.", lambda budget: budget.in_store_s
     ),
-    Family(
-        "coec_unseen_seconds",
-        "gauge",
-        "Time since the worker last looked at a pair.",
-        _PAIR,
-        _of_budget(lambda budget: {(name,): share.unseen_s for name, share in budget.pairs.items()}),
-    ),
-    Family(
-        "coec_worker_memory_bytes",
-        "gauge",
-        "Resident memory of the worker.",
-        (),
-        _one(lambda view: view.worker_memory_bytes),
-    ),
-    Family("coec_storage_used_bytes", "gauge", "All windows.", (), _one(lambda view: view.status.storage.bytes_used)),
-    Family(
-        "coec_storage_free_bytes", "gauge", "Free on the disk.", (), _one(lambda view: view.status.storage.bytes_free)
-    ),
-    Family(
+    _labelled("coec_unseen_seconds", "Time since the worker last looked at a pair.", "pair", _unseen, "gauge"),
+    _single("coec_worker_memory_bytes", "Resident memory of the worker.", lambda view: view.worker_memory_bytes),
+    _single("coec_storage_used_bytes", "All windows.", lambda view: view.status.storage.bytes_used),
+    _single("coec_storage_free_bytes", "Free on the disk.", lambda view: view.status.storage.bytes_free),
+    _labelled(
         "coec_storage_losses",
-        "counter",
         "What the state directory had to give up, by cause.",
-        ("cause",),
-        _of_worker(lambda view: view.status.storage.losses),
+        "cause",
+        lambda view: view.status.storage.losses,
     ),
 )
 """All families, in the order of the text."""
