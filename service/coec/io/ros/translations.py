@@ -155,53 +155,38 @@ def _of_kind(value: Any, kind: int, expected: int) -> bytes:
     return bytes(value)
 
 
-_TIMESTAMP: Final = {1: ("sec", "number"), 2: ("nsec", "number")}
-_VECTOR: Final = {1: ("x", "double"), 2: ("y", "double"), 3: ("z", "double")}
-_QUATERNION: Final = {**_VECTOR, 4: ("w", "double")}
-_TRANSFORM: Final = {
-    1: ("timestamp", _TIMESTAMP),
-    2: ("parent_frame_id", "text"),
-    3: ("child_frame_id", "text"),
-    4: ("translation", _VECTOR),
-    5: ("rotation", _QUATERNION),
-}
-_COMPRESSED_IMAGE: Final = {
-    1: ("timestamp", _TIMESTAMP),
-    2: ("data", "bytes"),
-    3: ("format", "text"),
-    4: ("frame_id", "text"),
-}
-_COMPRESSED_VIDEO: Final = {
-    1: ("timestamp", _TIMESTAMP),
-    2: ("frame_id", "text"),
-    3: ("data", "bytes"),
-    4: ("format", "text"),
-}
-_RAW_IMAGE: Final = {
-    1: ("timestamp", _TIMESTAMP),
-    2: ("width", "number"),
-    3: ("height", "number"),
-    4: ("encoding", "text"),
-    5: ("step", "number"),
-    6: ("data", "bytes"),
-    7: ("frame_id", "text"),
-}
-_POINT_CLOUD: Final = {
-    1: ("timestamp", _TIMESTAMP),
-    2: ("frame_id", "text"),
-    3: ("pose", {1: ("position", _VECTOR), 2: ("orientation", _QUATERNION)}),
-    4: ("point_stride", "number"),
-    5: ("fields", [{1: ("name", "text"), 2: ("offset", "number"), 3: ("type", "number")}]),
-    6: ("data", "bytes"),
-}
-_CALIBRATION: Final = {
-    1: ("timestamp", _TIMESTAMP),
-    2: ("width", "number"),
-    3: ("height", "number"),
-    4: ("distortion_model", "text"),
-    **{number: (name, "doubles") for number, name in ((5, "D"), (6, "K"), (7, "R"), (8, "P"))},
-    9: ("frame_id", "text"),
-}
+def _message(**fields: Any) -> Fields:
+    """A message whose fields are numbered in this order, from 1."""
+    return dict(enumerate(fields.items(), 1))
+
+
+_TIMESTAMP: Final = _message(sec="number", nsec="number")
+_VECTOR: Final = _message(x="double", y="double", z="double")
+_QUATERNION: Final = _message(x="double", y="double", z="double", w="double")
+_TRANSFORM: Final = _message(
+    timestamp=_TIMESTAMP, parent_frame_id="text", child_frame_id="text", translation=_VECTOR, rotation=_QUATERNION
+)
+_COMPRESSED_IMAGE: Final = _message(timestamp=_TIMESTAMP, data="bytes", format="text", frame_id="text")
+_COMPRESSED_VIDEO: Final = _message(timestamp=_TIMESTAMP, frame_id="text", data="bytes", format="text")
+_RAW_IMAGE: Final = _message(
+    timestamp=_TIMESTAMP, width="number", height="number", encoding="text", step="number", data="bytes", frame_id="text"
+)
+_POINT_CLOUD: Final = _message(
+    timestamp=_TIMESTAMP,
+    frame_id="text",
+    pose=_message(position=_VECTOR, orientation=_QUATERNION),
+    point_stride="number",
+    fields=[_message(name="text", offset="number", type="number")],
+    data="bytes",
+)
+_CALIBRATION: Final = _message(
+    timestamp=_TIMESTAMP,
+    width="number",
+    height="number",
+    distortion_model="text",
+    **dict.fromkeys("DKRP", "doubles"),
+    frame_id="text",
+)
 
 # --- Foxglove ---------------------------------------------------------------------------------------------------
 
@@ -290,7 +275,7 @@ _FOXGLOVE: Final[Mapping[str, tuple[str, Fields, Callable[[Mapping[str, Any]], A
     "foxglove.RawImage": (messages.IMAGE, _RAW_IMAGE, _raw_image),
     "foxglove.PointCloud": (messages.POINT_CLOUD, _POINT_CLOUD, _point_cloud),
     "foxglove.CameraCalibration": (messages.CAMERA_INFO, _CALIBRATION, _calibration),
-    "foxglove.FrameTransforms": (messages.TF, {1: ("transforms", [_TRANSFORM])}, _transforms),
+    "foxglove.FrameTransforms": (messages.TF, _message(transforms=[_TRANSFORM]), _transforms),
     "foxglove.FrameTransform": (messages.TF, _TRANSFORM, lambda values: _transforms({"transforms": [values]})),
 }
 
