@@ -80,7 +80,13 @@ def calibrate(
         except OutputError as error:
             not_written = error
             document["not_written"] = str(error)
-    console.report(document, lambda: _show(solution, document, intrinsics=intrinsics), as_json=as_json)
+    console.report(
+        document,
+        lambda: calibration.show(
+            solution.window, solution.result, solution.configuration, document, intrinsics=intrinsics
+        ),
+        as_json=as_json,
+    )
     if manifest is not None and solution.mistake is not None:
         show_correction(manifest, solution.mistake, loaded.window.rig)
     elif solution.mistake is not None and solution.mistake.correctable and has_manifest(source):
@@ -106,23 +112,6 @@ def _solved(loaded: LoadedWindow, options: CalibrationOptions, progress: StageTi
         if manifest is not None:
             show_correction(manifest, error.mistake, loaded.window.rig)
         raise
-
-
-def _show(solution: Solution, document: dict[str, Any], *, intrinsics: bool) -> None:
-    from coec.reports import calibration
-
-    calibration.show(
-        solution.window,
-        solution.result,
-        configuration=solution.configuration,
-        camera_fit=document.get("camera_fit"),
-        time_offset=document.get("time_offset"),
-        mistake=document["mistake"],
-        recognitions=document["recognitions"],
-        weighed=document["weighed"],
-        elapsed_s=document["elapsed_s"],
-        intrinsics=intrinsics,
-    )
 
 
 def _document(solution: Solution, elapsed_s: dict[str, float]) -> dict[str, Any]:
@@ -198,13 +187,8 @@ def _write(
         blocks = (*blocks, Pictures((file_picture(paths[-1]),)))
     report = CalibrationReport.model_validate(document)
     written = files.write_output(folder / "result.json", to_json(report))
-    remarks = calibration.remarks(
-        document.get("camera_fit"),
-        document.get("time_offset"),
-        document["mistake"],
-        document["recognitions"],
-        document["weighed"],
-    )
+    mistake = [] if document["mistake"] is None else [document["mistake"]["text"]]
+    remarks = [*mistake, *calibration.remarks(document)]
     of_result = calibration_page(
         report, window, calibration.start_of(window), blocks, remarks, Provenance.here(), intrinsics=intrinsics
     )

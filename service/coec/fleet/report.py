@@ -139,20 +139,23 @@ def _parquet(rows: Sequence[WindowRow]) -> bytes:
     return stream.getvalue()
 
 
+_OF_ROW = {"url", "sha256", "bytes", "seconds", "cpu_s", "error_code", "error"}
+_OF_RESULT = {
+    *("window_id", "pair", "camera_frame", "lidar_frame", "pairs", "independent_looks", "score", "score_at_start"),
+    *("mi", "overlap", "points_in_view", "evaluations", "stop_reason", "first_derivative", "second_derivative"),
+    *("depth_identity", "config_hash"),
+}
+"""Columns that are fields of a row, or of its result, by the same name."""
+
+
 def _row_values(row: WindowRow) -> dict[str, Any]:
     """The values of a row. Maps are in the order of their names, so that equal rows give equal bytes, also in a resumed
     batch."""
     fields: dict[str, Any] = {
-        "url": row.url,
-        "sha256": row.sha256,
-        "bytes": row.bytes,
+        **row.model_dump(include=_OF_ROW),
         "recorded_decision": row.recorded,
         "decision": row.decided,
         "versions": sorted(row.versions.items()),
-        "seconds": row.seconds,
-        "cpu_s": row.cpu_s,
-        "error_code": row.error_code,
-        "error": row.error,
     }
     result = row.result
     if result is None:
@@ -160,13 +163,9 @@ def _row_values(row: WindowRow) -> dict[str, Any]:
     seen = zip(result.solved, result.unobservable, strict=True)
     return {
         **fields,
-        "window_id": result.window_id,
-        "pair": result.pair,
-        "camera_frame": result.camera_frame,
-        "lidar_frame": result.lidar_frame,
+        **result.model_dump(include=_OF_RESULT),
         "stamp_ns": result.data_stamp_ns,
         "time": _time(result.data_stamp_ns),
-        "pairs": result.pairs,
         **dict(zip(AXES, result.correction, strict=True)),
         **{f"sigma_{axis}": value for axis, value in zip(AXES, result.sigma, strict=True)},
         "correlation": _correlation(result.noise),
@@ -177,18 +176,6 @@ def _row_values(row: WindowRow) -> dict[str, Any]:
         "reasons": [reason.text for reason in result.verdict.reasons],
         "figures": [(name, metric.value) for name, metric in sorted(result.metrics.items())],
         "limits": [(name, metric.limit) for name, metric in sorted(result.metrics.items())],
-        "independent_looks": result.independent_looks,
-        "score": result.score,
-        "score_at_start": result.score_at_start,
-        "mi": result.mi,
-        "overlap": result.overlap,
-        "points_in_view": result.points_in_view,
-        "evaluations": result.evaluations,
-        "stop_reason": result.stop_reason,
-        "first_derivative": result.first_derivative,
-        "second_derivative": result.second_derivative,
-        "depth_identity": result.depth_identity,
-        "config_hash": result.config_hash,
         "result": to_json(result).decode(),
     }
 

@@ -35,34 +35,19 @@ NOT_COMPENSATED: Mapping[Compensation, str] = {
 def show(
     window: Window,
     result: CalibrationResult,
-    *,
     configuration: CalibrationConfig,
-    camera_fit: Mapping[str, Any] | None,
-    time_offset: Mapping[str, Any] | None,
-    mistake: Mapping[str, Any] | None,
-    recognitions: Sequence[Mapping[str, Any]],
-    weighed: Mapping[str, int] | None = None,
-    elapsed_s: Mapping[str, float],
+    document: Mapping[str, Any],
+    *,
     intrinsics: bool = False,
 ) -> None:
-    """Prints the result of a window.
-
-    Args:
-        window, result: what was calibrated, and the result.
-        configuration: with which it was calibrated.
-        camera_fit, time_offset: as `--json` has them; None: not asked for.
-        mistake: in the inputs, as `--json` has it; None: none was found.
-        recognitions: of the recording, as `--json` has them.
-        weighed: poses without a start, as `--json` has them; None: there was a start.
-        elapsed_s: seconds by stage.
-        intrinsics: whether the lens is shown, too.
-    """
+    """Prints the result of a window, which was calibrated with this configuration; `document` is what `--json` prints,
+    `intrinsics` says whether the lens is shown, too."""
     console.show(f"{window.window_id}: {count(result.pairs, 'pair')}, {result.points_in_view} points in view")
     _show_axes(window, result)
     console.show_verdict(result)
     if not _accepted(result):
-        if mistake is not None:
-            console.show(mistake["text"], "bold yellow")
+        if document["mistake"] is not None:
+            console.show(document["mistake"]["text"], "bold yellow")
         console.show("what follows was not accepted: it is the best guess, and not to be used on a vehicle", "yellow")
     show_pose(
         result.camera_from_lidar, result.lidar_frame, result.camera_frame, warning="" if _accepted(result) else REFUSED
@@ -75,7 +60,7 @@ def show(
         console.show(
             "the field `ring` holds one number and was ignored: beams were told apart by their elevation", "yellow"
         )
-    for note in remarks(camera_fit, time_offset, None, recognitions, weighed):
+    for note in remarks(document):
         console.show(note)
     if result.independent_looks is not None:
         console.show(
@@ -83,30 +68,24 @@ def show(
         )
     if result.cues is not None:
         console.show(_cues_text(result.cues))
-    stages = "  ".join(f"{stage} {seconds:.2f} s" for stage, seconds in elapsed_s.items())
+    stages = "  ".join(f"{stage} {seconds:.2f} s" for stage, seconds in document["elapsed_s"].items())
     console.show(f"{result.evaluations} evaluations, {result.stop_reason}; {stages}")
 
 
-def remarks(
-    camera_fit: Mapping[str, Any] | None,
-    time_offset: Mapping[str, Any] | None,
-    mistake: Mapping[str, Any] | None = None,
-    recognitions: Sequence[Mapping[str, Any]] = (),
-    weighed: Mapping[str, int] | None = None,
-) -> list[str]:
-    """What else was found out, one sentence each; all arguments as `--json` has them, None: not asked for, or none."""
-    sentences = [str(one["text"]) for one in (*([] if mistake is None else [mistake]), *recognitions)]
-    if weighed is not None:
+def remarks(document: Mapping[str, Any]) -> list[str]:
+    """What else was found out beside a mistake in the inputs, one sentence each, from what `--json` prints."""
+    sentences = [str(one["text"]) for one in document["recognitions"]]
+    if (weighed := document["weighed"]) is not None:
         sentences.append(
             f"without a start, {weighed['rotations']} rotations were weighed: {weighed['ascended']} maxima climbed, "
             f"{count(weighed['ranked'], 'basin')} ranked by edges and depth, {weighed['solved']} solved"
         )
-    if camera_fit is not None:
+    if (camera_fit := document.get("camera_fit")) is not None:
         sentences.append(
             f"{camera_fit['model']} fitted to {camera_fit['of']}: {camera_fit['residual_rms_px']:.4f} px rms, "
             f"{camera_fit['residual_max_px']:.4f} px at most"
         )
-    if time_offset is not None:
+    if (time_offset := document.get("time_offset")) is not None:
         sentences.append(f"camera after its stamp: {_offset_text(time_offset)}")
     return sentences
 

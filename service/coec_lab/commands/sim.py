@@ -42,7 +42,7 @@ def rig_drives(
     from coec.reports import console
     from coec.schemas.message import to_json
     from coec_lab.commands.drive_pool import drive_file, finished, resumed
-    from coec_lab.experiments import rig_drive_statistics, rig_drives, rig_moves
+    from coec_lab.experiments import rig_drives, rig_moves
     from coec_lab.experiments.rig_drives import DisplacedRigDrive
     from coec_lab.experiments.simulation_schemas import RigDriveRow
     from coec_lab.simulation.source import require_embree
@@ -58,7 +58,7 @@ def rig_drives(
             user_files.replace_output(drive_file(output, row.name), to_json(row))
             rows[row.name] = row
             bars.update(task, advance=1, note=row.name)
-    report = rig_drive_statistics.report([rows[name] for name in names], camera)
+    report = rig_drives.report([rows[name] for name in names], camera)
     user_files.write_output(output / "report.json", to_json(report))
     console.report(report, lambda: rig_moves.show_drives(report), as_json=as_json)
     return 0

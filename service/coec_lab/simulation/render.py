@@ -44,21 +44,14 @@ class PixelRays(NamedTuple):
     pixel_rad: float
 
 
-class RenderedView(NamedTuple):
-    """A picture.
+class Radiance(NamedTuple):
+    """Light at the lens, before exposure.
 
     Attributes:
-        bgr: (height, width, 3) uint8; black where the camera sees nothing.
+        linear: (height, width, 3) float32 BGR; black where the camera sees nothing.
         range_m: (height, width) float32, Euclidean distance from the camera to what the middle of each pixel shows;
             NaN for the sky and where the camera sees nothing.
     """
-
-    bgr: NDArray[np.uint8]
-    range_m: Floats
-
-
-class Radiance(NamedTuple):
-    """Light at the lens, before exposure. `linear`: (height, width, 3) float32 BGR; `range_m` as in `View`."""
 
     linear: Floats
     range_m: Floats
@@ -72,31 +65,6 @@ def pixel_rays(camera: Camera, half_view_rad: float = np.pi) -> PixelRays:
     index = np.flatnonzero(valid & (rays[:, 2] >= np.cos(half_view_rad)))
     pixel_rad = float(1.0 / np.sqrt(camera.fx * camera.fy))
     return PixelRays(index, np.ascontiguousarray(rays[index], np.float32), pixel_rad)
-
-
-def render_view(
-    scene: Scene,
-    camera: Camera,
-    T_world_camera: Matrix4,
-    *,
-    time_s: float = 0.0,
-    half_view_rad: float = np.pi,
-    smooth_edges: bool = True,
-    exposure: float = 0.9,
-) -> RenderedView:
-    """A perfect camera's picture: no noise, no blur, no vignetting.
-
-    Args:
-        T_world_camera: (4, 4) maps camera coordinates (x right, y down, z forward) to the world (z up).
-        time_s: instant that decides where the moving cars are.
-        half_view_rad: pixels further off the axis stay black (the lens's circle).
-        smooth_edges: whether to cast more rays where neighbouring pixels differ.
-        exposure: factor on the light before the gamma curve.
-    """
-    radiance = render_radiance(
-        scene, camera, T_world_camera, time_s=time_s, half_view_rad=half_view_rad, smooth_edges=smooth_edges
-    )
-    return RenderedView(tone(radiance.linear, exposure), radiance.range_m)
 
 
 def tone(linear: Floats, exposure: float) -> NDArray[np.uint8]:
@@ -122,7 +90,14 @@ def render_radiance(
     half_view_rad: float = np.pi,
     smooth_edges: bool = True,
 ) -> Radiance:
-    """See `render_view`."""
+    """What a perfect lens sees: no noise, no blur, no vignetting.
+
+    Args:
+        T_world_camera: (4, 4) maps camera coordinates (x right, y down, z forward) to the world (z up).
+        time_s: instant that decides where the moving cars are.
+        half_view_rad: pixels further off the axis stay black (the lens's circle).
+        smooth_edges: whether to cast more rays where neighbouring pixels differ.
+    """
     whole = Exposure(0, camera.height, T_world_camera, time_s)
     return render_rows(scene, camera, [whole], half_view_rad=half_view_rad, smooth_edges=smooth_edges)
 

@@ -11,8 +11,8 @@ from coec.calibration.types import Matrix4
 from coec.geometry.compiler import PRANGE, njit, prange
 from coec_lab.simulation.mesh import Floats, Material
 from coec_lab.simulation.passages import SPINE_M
+from coec_lab.simulation.reflectance import FOLIAGE, GLASS, LACQUER, LAMP, LIT, SALTS, hashed, noise, texture
 from coec_lab.simulation.scene import Hits, Scene
-from coec_lab.simulation.textures import FOLIAGE, GLASS, LACQUER, LAMP, LIT, SALTS, hashed, noise, texture
 from coec_lab.simulation.weather import Sky
 
 Doubles = NDArray[np.float64]

@@ -15,16 +15,19 @@ from coec.geometry import se3
 from coec.schemas.replies import Vector6
 from coec_lab.experiments import rig_drives
 from coec_lab.experiments.check_drives import CHECK_PAIRS
-from coec_lab.experiments.rig_drive_statistics import DISPLACEMENTS, SensorDisplacement, moves_of, report
 from coec_lab.experiments.rig_drives import (
+    DISPLACEMENTS,
     FIRST_SEED,
     LIDAR,
     PERIOD_S,
     TURN_S,
     DisplacedRigDrive,
+    SensorDisplacement,
     answer_ns,
     driven,
     due,
+    moves_of,
+    report,
     request_stamps_ns,
     variant,
 )

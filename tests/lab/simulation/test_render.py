@@ -1,6 +1,7 @@
 """Pictures: range against the analytic one, shadows, determinism."""
 
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from coec.geometry import cameras
 from coec.geometry.projection import unproject
 from coec_lab.simulation.drive import fisheye
 from coec_lab.simulation.mesh import Material, Mesh, box, join, quads
-from coec_lab.simulation.render import render_view
+from coec_lab.simulation.render import render_radiance, tone
 from coec_lab.simulation.road import build_road
 from coec_lab.simulation.scene import Scene, Town
 from coec_lab.simulation.weather import sample_sky
@@ -26,6 +27,16 @@ AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 def a_scene(mesh: Mesh, sun: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Scene:
     sky = replace(sample_sky(0), towards_sun=np.array(sun, np.float32), sun=(1.0, 1.0, 1.0), clouds=0.0)
     return Scene(build_road(0, -10.0, 10.0), sky, np.array([1000.0, 2000.0, 30.0]), mesh, [])
+
+
+class RenderedView(NamedTuple):
+    bgr: NDArray[np.uint8]
+    range_m: NDArray[np.float32]
+
+
+def render_view(scene: Scene, camera: cameras.Camera, pose: NDArray[np.float64], **options: Any) -> RenderedView:
+    radiance = render_radiance(scene, camera, pose, **options)
+    return RenderedView(tone(radiance.linear, 0.9), radiance.range_m)
 
 
 def looking_ahead(height_m: float) -> NDArray[np.float64]:
