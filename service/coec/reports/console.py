@@ -16,7 +16,6 @@ from contextlib import AbstractContextManager, nullcontext
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel
 from rich import progress as rich_progress
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.highlighter import JSONHighlighter
@@ -253,7 +252,7 @@ def report(document: Any, show: Callable[[], object], *, as_json: bool) -> None:
 def print_json(document: Any) -> None:
     """The one document of `--json`, a wire model or what JSON consists of: a line with sorted keys, floats in the
     shortest form that reads back exactly."""
-    if isinstance(document, BaseModel):
+    if hasattr(document, "model_dump"):
         document = document.model_dump(mode="json")
     escaped = not formatting.is_unicode(sys.stdout.encoding)
     text = json.dumps(document, sort_keys=True, separators=(",", ":"), ensure_ascii=escaped, allow_nan=False)
