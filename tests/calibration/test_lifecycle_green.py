@@ -20,8 +20,8 @@ from coec.calibration.state import ExtrinsicHold, PairState
 from coec.calibration.state_machine import HealthState
 from coec.calibration.types import Decision, Estimate
 from coec.service.engine.check_progress import CheckProgress
-from coec.service.engine.messages import SelectionStatistics, StreamStatistics
 from coec.service.ingest.decoder import CAMERA, LIDAR, StreamCounts
+from coec.service.ingest.pair_stream import SelectionStatistics, StreamStatistics
 
 S = 1_000_000_000
 PERIOD_S = RULES.monitor.period_s

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -17,14 +16,6 @@ from coec.service.engine import frame_selector
 from coec.service.ingest.decoder import EXPLAINED, QUIET_S, RATE_FRAMES, SILENT_S, StreamLog
 from coec.service.worker.compilation import Compiling
 from support.vehicles import BEGIN_S, DRIVE_END_S, NS_PER_S, STEP_S, PairBench, SlowWorker, frame_pair_at
-
-
-@dataclass
-class Clock:
-    now_s: float = 1000.0
-
-    def __call__(self) -> float:
-        return self.now_s
 
 
 def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
@@ -101,10 +92,10 @@ def test_the_stream_does_not_wait_for_a_worker_that_compiles_its_kernels(tmp_pat
                 pass
 
     drive(BEGIN_S, BEGIN_S + 60)
-    assert len(bench.pair.stream.held) > 0
+    assert len(bench.pair.stream.held.pairs) > 0
     bench.worker.warms_up = True
     drive(BEGIN_S + 60, BEGIN_S + 120)
-    assert len(bench.pair.stream.held) == 0
+    assert len(bench.pair.stream.held.pairs) == 0
     assert ("monitor", "not_awaited") not in bench.losses
     assert bench.recorder.recorded > 1, "windows are recorded meanwhile"
 
@@ -124,33 +115,33 @@ def test_the_first_frame_of_a_stream_is_described(
     kind: str, frame: CameraFrame | LidarFrame | EgoMotion, shape: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
-    log = StreamLog(kind, "in/sensor", Clock())
-    log.push(frame)
-    log.push(frame)
+    log = StreamLog(kind, "in/sensor")
+    log.push(frame, 0.0)
+    log.push(frame, 0.0)
     assert lines(caplog) == [f"first {kind} frame: {shape}"]
 
 
 def test_the_rate_of_a_stream_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
-    log = StreamLog("camera", "in/camera", Clock())
+    log = StreamLog("camera", "in/camera")
     for number in range(3 * RATE_FRAMES):
-        log.push(camera(number * NS_PER_S // 10))
+        log.push(camera(number * NS_PER_S // 10), 0.0)
     assert lines(caplog)[1:] == ["camera frames arrive at 10.0 Hz by their stamps"]
 
 
 def test_a_stream_that_is_lost_and_comes_back_is_logged_at_a_bounded_rate(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
-    clock = Clock()
-    log = StreamLog("lidar", "in/lidar", clock)
-    log.tick()
+    now_s = 0.0
+    log = StreamLog("lidar", "in/lidar")
+    log.tick(now_s)
     assert lines(caplog) == [], "a stream from which nothing has come is reported by health"
     sweep = LidarFrame(0, "roof", np.zeros((7, 3), np.float32))
     for _ in range(20):
-        log.push(sweep)
+        log.push(sweep, now_s)
         for _ in range(2 * int(SILENT_S)):
-            clock.now_s += 1.0
-            log.tick()
-    log.push(sweep)
+            now_s += 1.0
+            log.tick(now_s)
+    log.push(sweep, now_s)
     reported = lines(caplog)
     silent = [line for line in reported if line.startswith("no lidar frames for")]
     again = [line for line in reported if line.startswith("lidar frames arrive again after")]

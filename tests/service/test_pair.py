@@ -20,7 +20,7 @@ from coec.calibration.types import (
 from coec.io.rig_files import save_baseline
 from coec.io.serialise import matrix_of
 from coec.io.storage import StateFile
-from coec.service.engine.pair_stream import PairStream
+from coec.service.ingest.pair_stream import PairStream
 from coec.service.recording.window_store import start_ns_of
 from support.estimates import a_baseline
 from support.vehicles import (
@@ -148,13 +148,13 @@ def test_a_stream_that_has_waited_for_too_long_goes_on_and_says_so(tmp_path: Pat
         bench.hold(frame_pair_at(stamp_ns))
         while bench.pair.advance(bench.clock.monotonic_s()):
             pass
-    waiting = len(bench.pair.stream.held)
+    waiting = len(bench.pair.stream.held.pairs)
     assert waiting > 0
     assert ("monitor", "not_awaited") not in bench.losses
     bench.vehicle.waiting_frames._max_bytes = 0
     while bench.pair.advance(bench.clock.monotonic_s()):
         pass
-    assert len(bench.pair.stream.held) == 0
+    assert len(bench.pair.stream.held.pairs) == 0
     assert bench.losses["monitor", "not_awaited"] == waiting
 
 

@@ -118,12 +118,12 @@ class Watched:
         bench.worker.submit = requested  # type: ignore[method-assign]
 
     def push(self, frame: Frame) -> None:
-        self.bench.pair.stream.push(frame)
+        self.bench.pair.stream.push(frame, self.bench.clock.monotonic_s())
         self.bench.settle()
 
     def finish(self) -> None:
         """The streams have ended, and all is judged."""
-        self.bench.pair.stream.flush()
+        self.bench.pair.stream.flush(self.bench.clock.monotonic_s())
         for _ in range(1000):
             if isinstance(self.bench.worker, SlowWorker):
                 self.bench.worker.work(share=1.0)
@@ -203,7 +203,7 @@ def disturbed(folder: Path, seed: int, clock: Clock) -> dict[str, Any]:
             clock.now_s += STALL_S
             bench.check_clocks()
         watched.push(frame)
-        bench.pair.tick(waiting=False)
+        bench.pair.tick(clock.now_s, waiting=False)
     watched.finish()
     assert "degraded" in [entry.code for entry in bench.entries("state")], "checks were overdue"
     return watched.reported
@@ -217,7 +217,7 @@ def wait_in_silence(watched: Watched, clock: Clock) -> None:
         clock.now_s += STALL_S / 20
         bench.worker.work(share=0.5)
         bench.settle()
-        bench.pair.tick(waiting=False)
+        bench.pair.tick(clock.now_s, waiting=False)
     assert isinstance(watched.windows[-1], SliceClosed), "silence ends the slice"
 
 

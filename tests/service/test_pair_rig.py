@@ -110,7 +110,9 @@ class RigBench:
         """Pairs of frames, twice a second, of each pair in turn; each is settled some time later."""
         for stamp_ns in range(begin_s * NS_PER_S, end_s * NS_PER_S, NS_PER_S // 2):
             for name in self.rng.sample(CAMERAS, 3):
-                self.pairs[name].stream.hold([frame_pair_at(stamp_ns)], set_clock=True)
+                self.pairs[name].stream.hold(
+                    [frame_pair_at(stamp_ns)], self.vehicle.clock.monotonic_s(), set_clock=True
+                )
                 if self.rng.random() < 0.7:
                     self.settle()
         self.settle()
@@ -120,7 +122,7 @@ class RigBench:
         while self.vehicle.turn(0.0):
             pass
         for pair in self.pairs.values():
-            pair.stream.renew_report(pair.engine.selector.statistics)
+            pair.stream.renew_report(pair.engine.selector.statistics, self.vehicle.clock.monotonic_s())
             pair._tick()
 
     def do(self, name: str, **arguments: Any) -> Acknowledgement:

@@ -15,7 +15,7 @@ from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFo
 from coec.config import CalibrationConfig, StateConfig
 from coec.geometry.cameras import build
 from coec.io.logs import LossCounter
-from coec.service.ingest.frame_buffers import Snippet
+from coec.service.ingest.pair_stream import Snippet
 from coec.service.recording.recorder import Recorder, RecordingPlan, RecordingThread, RecordPair
 from coec.service.recording.snippets import SnippetRecorder, SnippetStore
 from coec.service.recording.window_store import WindowStore

@@ -323,7 +323,7 @@ class LidarBench:
         for sensor in self.vehicle.sensors:
             if sensor.config.sensor in (stream, f"in/{stream}"):
                 for taker in sensor.takers:
-                    taker(frame)
+                    taker(frame, self.vehicle.clock.monotonic_s())
 
     def settle(self) -> None:
         """What the engine does until there is nothing more that it may do."""

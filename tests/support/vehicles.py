@@ -455,18 +455,21 @@ class PairBench:
     def settle(self) -> None:
         """What the engine does until there is nothing more that it may do."""
         while self.vehicle.turn(0.0):
-            self.pair.stream.renew_report(self.pair.engine.selector.statistics)
+            self.renew_report()
         if isinstance(self.worker, SlowWorker):
             self.worker.work(share=0.05)
 
     def hold(self, pair: FramePair) -> None:
         """A frame pair has come."""
-        self.pair.stream.hold([pair], set_clock=True)
+        self.pair.stream.hold([pair], self.clock.monotonic_s(), set_clock=True)
+
+    def renew_report(self) -> None:
+        self.pair.stream.renew_report(self.pair.engine.selector.statistics, self.clock.monotonic_s())
 
     def check_clocks(self, ahead_s: float = 0.0) -> None:
         """The clocks are evaluated as they will be in `ahead_s`."""
         self.clock.ahead_s = ahead_s
-        self.pair.stream.renew_report(self.pair.engine.selector.statistics)
+        self.renew_report()
         self.pair._tick()
         self.clock.ahead_s = 0.0
 

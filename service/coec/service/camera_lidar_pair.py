@@ -3,11 +3,10 @@ the state machine go.
 """
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
 
 from coec.calibration.frames.window import SliceClosed
-from coec.calibration.types import Frame
 from coec.config import CalibrationConfig, Config, PairConfig
 from coec.io.logs import LossCounter
 from coec.io.msgpack_frames import encode
@@ -19,10 +18,9 @@ from coec.service.engine import messages
 from coec.service.engine.commands import CommandExecutor, PairCommand, Surroundings
 from coec.service.engine.frame_selector import FrameSelector
 from coec.service.engine.pair import Pair
-from coec.service.engine.pair_stream import PairStream
 from coec.service.engine.schedule import Request, Schedule
-from coec.service.ingest.decoder import SensorStream
-from coec.service.ingest.frame_buffers import FrameRing
+from coec.service.ingest.decoder import SensorStream, Taker
+from coec.service.ingest.pair_stream import FrameRing, PairBuffer, PairStream
 from coec.service.recording.recorder import RecordBetween, Recorder, RecordingPlan, RecordPair, WindowRecorded
 from coec.service.recording.snippets import SnippetRecorder
 from coec.service.records.pair_store import PairStore
@@ -76,7 +74,8 @@ class CameraLidarPair:
         # Half of the pair's share, because as much again is in memory while a snippet is written.
         ring_bytes = config.snippets.memory_bytes // (2 * max(len(config.every_pair), 1))
         ring = None if snippets is None else FrameRing(config.snippets, ring_bytes, snippets.submit)
-        self.stream = PairStream(pair, config, vehicle, losses, ring)
+        held = PairBuffer(vehicle.waiting_frames, config.worker.timeout_s)
+        self.stream = PairStream(pair, vehicle.sensors_of(pair), held, losses, ring)
         self.commands = Commands(pair.name, config.vehicle, store, vehicle.inbox)
         self.answers = PairAnswers(
             pair, config, rig, store, folder, self.recorder, self.stream, context, self.commands.counted
@@ -109,7 +108,7 @@ class CameraLidarPair:
         """Number of checks and windows without a result."""
         return self.engine.unanswered
 
-    def taker(self, name: str) -> Callable[[Frame], None]:
+    def taker(self, name: str) -> Taker:
         """The function that takes the frames of a stream; each frame says of which it is."""
         del name
         return self.stream.push
@@ -138,26 +137,27 @@ class CameraLidarPair:
         recorder has room; or it has waited too long, or too many frames wait. Returns whether it did."""
         if self.engine.needs_tick(now_s):
             self._tick()
-        stamp_ns = self.stream.next_ns
-        if stamp_ns is None:
+        held = self.stream.held
+        if not held.pairs:
             return False
+        stamp_ns = held.pairs[0].camera.stamp_ns
         self.engine.warms_up = self._context.worker.warms_up
         self._step(messages.SensorTime(stamp_ns))
         is_forced = not self.recorder.has_room or self.engine.waits(stamp_ns)
         if not is_forced:
-            self.stream.held.stop_waiting()
-        elif not self.stream.held.has_waited(now_s):
+            held.stop_waiting()
+        elif not held.has_waited(now_s):
             return False
-        self._step(messages.Evaluate(self.stream.take(), is_forced))
+        self._step(messages.Evaluate(self.stream.take(now_s), is_forced))
         return True
 
-    def tick(self, *, waiting: bool) -> None:
+    def tick(self, now_s: float, *, waiting: bool) -> None:
         """Time has passed; `waiting`: samples of the streams are in the inbox. Ends a slice in silence."""
-        self.stream.tick(self.engine.selector.statistics, waiting=waiting)
+        self.stream.tick(self.engine.selector.statistics, now_s, waiting=waiting)
         end_ns = self.engine.selector.slice_end_ns
-        if end_ns is not None and self.stream.silence_ends(end_ns):
-            self.stream.end_in_silence(end_ns, self.engine.selector.statistics.last_ns)
-            if not self.stream.held:
+        if end_ns is not None and self.stream.silence_ends(end_ns, now_s):
+            self.stream.end_in_silence(end_ns, self.engine.selector.statistics.last_ns, now_s)
+            if not self.stream.held.pairs:
                 self._step(messages.SensorTime(end_ns))
 
     def _tick(self) -> None:
@@ -165,10 +165,11 @@ class CameraLidarPair:
 
     def finish_pairs(self) -> None:
         """Evaluates every frame pair that has come, even if it should wait for a result."""
-        self.stream.flush()
-        while (stamp_ns := self.stream.next_ns) is not None:
-            self._step(messages.SensorTime(stamp_ns))
-            self._step(messages.Evaluate(self.stream.take(), is_forced=True))
+        now_s = self._context.vehicle.clock.monotonic_s()
+        self.stream.flush(now_s)
+        while self.stream.held.pairs:
+            self._step(messages.SensorTime(self.stream.held.pairs[0].stamp_ns))
+            self._step(messages.Evaluate(self.stream.take(now_s), is_forced=True))
 
     def finish_window(self) -> None:
         """Ends the open window when the service ends; called after the thread of the engine has ended."""

@@ -471,10 +471,10 @@ class DriveReplay:
     def _settle(self) -> None:
         """Has the engine do all that it may, and waits for the results that it waits for."""
         pair = self._pair
-        while self._vehicle.turn(0.0) or pair.stream.held:
-            if not pair.stream.held:
+        while self._vehicle.turn(0.0) or pair.stream.held.pairs:
+            if not pair.stream.held.pairs:
                 continue
-            if pair.engine.oldest_request is not None and pair.engine.waits(pair.stream.held.next_ns):
+            if pair.engine.oldest_request is not None and pair.engine.waits(pair.stream.held.pairs[0].stamp_ns):
                 self._deliver_oldest(pair.engine.oldest_request)
             elif not pair.recorder.has_room:
                 time.sleep(POLL_S)  # the disk is slower than the replay
@@ -483,7 +483,7 @@ class DriveReplay:
         """The drive has ended: takes all results, and ends the open slice at its end, as silence would in the
         service."""
         pair = self._pair
-        pair.stream.flush()
+        pair.stream.flush(self._clock.monotonic_s())
         self._settle()
         while pair.engine.oldest_request is not None or pair.engine.selector.slice_end_ns is not None:
             pair.end_slice()

@@ -27,7 +27,7 @@ from coec.config import (
 from coec.errors import CalibrationError
 from coec.io.mcap.windows import WindowWriter, read_window
 from coec.io.rig_files import intrinsics_config
-from coec.service.ingest.frame_buffers import frame_bytes
+from coec.service.ingest.pair_stream import frame_bytes
 from coec.service.worker import worker_jobs
 from coec.service.worker.supervisor import Worker, WorkerState
 from coec.service.worker.worker_jobs import JobOutcome

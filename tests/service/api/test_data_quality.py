@@ -6,8 +6,8 @@ import pytest
 
 from coec.config import IDENTITY, CameraConfig, CameraIntrinsics, EgoConfig, LidarConfig, PairConfig
 from coec.service.api.reply_builders import data_quality_of, needs_of
-from coec.service.engine.messages import StreamStatistics
 from coec.service.ingest.decoder import EGO, StreamCounts
+from coec.service.ingest.pair_stream import StreamStatistics
 from support.estimates import estimate
 
 PAIR = PairConfig(

@@ -16,7 +16,8 @@ from coec.reports import replies as shown
 from coec.schemas.message import to_json
 from coec.schemas.replies import HealthReply
 from coec.service.api.reply_builders import extrinsic_of, health_of
-from coec.service.engine.messages import PairSnapshot, StreamStatistics
+from coec.service.engine.messages import PairSnapshot
+from coec.service.ingest.pair_stream import StreamStatistics
 from coec.service.records.pair_store import ServedExtrinsic
 from support.estimates import ESTIMATE_RIG, estimate
 

@@ -8,8 +8,8 @@ import pytest
 
 from coec.calibration.types import Reason
 from coec.service.engine.check_progress import Attempts, CheckProgress
-from coec.service.engine.messages import SelectionStatistics, StreamStatistics
 from coec.service.ingest.decoder import CAMERA, LIDAR, StreamCounts
+from coec.service.ingest.pair_stream import SelectionStatistics, StreamStatistics
 
 S = 1_000_000_000
 PERIOD_S = 5.0

@@ -14,13 +14,13 @@ from coec.service.engine.messages import (
     JobDone,
     Publish,
     SensorTime,
-    StreamStatistics,
     SubmitCheck,
     SubmitSolve,
     Tick,
     WindowSubject,
 )
 from coec.service.engine.pair import Pair
+from coec.service.ingest.pair_stream import StreamStatistics
 from coec.service.recording.recorder import WindowLost, WindowRecorded
 from coec.service.worker.worker_jobs import DEADLINE_S, Fate, JobOutcome, Kind
 from support.vehicles import BEGIN_S, NS_PER_S, STEP_S, PairBench, frame_pair_at

@@ -41,12 +41,13 @@ def traced(bench: PairBench, stamp_ns: int) -> Trace:
     assert pair.motion is not None
     packed = {EGO: encode_ego(pair.motion), LIDAR: encode_lidar(pair.lidar), CAMERA: encode_camera(pair.camera)}
     for kind, payload in packed.items():
-        sample = InputSample(payload, MSGPACK)
+        sample, put = InputSample(payload, MSGPACK), bench.vehicle.inbox.receiver(bench.pair.sensors[kind].number)
         before = sys.getprofile()
         sys.setprofile(trace)
-        bench.vehicle.inbox.put(bench.pair.sensors[kind].number, sample)
-        while bench.vehicle.turn(0.0):
-            pass
+        put(sample)
+        bench.vehicle.turn(0.0)
+        while bench.vehicle.is_busy:
+            bench.vehicle.turn(0.0)
         sys.setprofile(before)
     return trace
 

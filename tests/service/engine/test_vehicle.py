@@ -22,12 +22,12 @@ from coec.io.msgpack_frames import encode_camera, encode_ego, encode_lidar
 from coec.io.zenoh.bus import InputSample
 from coec.service.camera_lidar_pair import CameraLidarPair
 from coec.service.cpu_budget import Budget
-from coec.service.engine.messages import Action, Evaluate, Event, SelectionStatistics, SensorTime
+from coec.service.engine.messages import Action, Evaluate, Event, SensorTime
 from coec.service.engine.pair import Pair
-from coec.service.engine.pair_stream import PairStream
 from coec.service.engine.rig import RigEstimator
 from coec.service.engine.vehicle import Vehicle
 from coec.service.ingest.decoder import CAMERA, EGO, FRAMES_WAITING, LIDAR, read_alike
+from coec.service.ingest.pair_stream import PairBuffer, PairStream, SelectionStatistics
 from coec.service.recording.recorder import Recorder
 from coec.service.vehicle_context import VehicleContext
 from support.vehicles import HEIGHT, WIDTH, pair_configuration
@@ -95,7 +95,9 @@ class ObservedPair(CameraLidarPair):
 
     def __init__(self, pair: PairConfig, config: Config, engine: Vehicle, observations: Observations) -> None:
         self.name = pair.name
-        self.stream = PairStream(pair, config, engine, LossCounter(logging.getLogger("test"), pair.name))
+        held = PairBuffer(engine.waiting_frames, config.worker.timeout_s)
+        losses = LossCounter(logging.getLogger("test"), pair.name)
+        self.stream = PairStream(pair, engine.sensors_of(pair), held, losses)
         self.engine = cast("Pair", observations)
         self.recorder = cast("Recorder", SimpleNamespace(has_room=True))
         worker = SimpleNamespace(warms_up=False)
@@ -153,7 +155,7 @@ class VehicleBench:
         while self.engine.turn(0.0):
             pass
         for pair in self.pairs.values():
-            pair.stream.renew_report(pair.engine.selector.statistics)
+            pair.stream.renew_report(pair.engine.selector.statistics, self.engine.clock.monotonic_s())
 
     def drive(self, numbers: Sequence[int], cameras: int, lidars: int) -> None:
         for number in numbers:
@@ -377,7 +379,7 @@ def test_silence_of_a_pair_is_noticed_while_others_speak(monkeypatch: pytest.Mon
         vehicle.settle()
         for pair in vehicle.pairs.values():
             waiting = {sensor.number for sensor in pair.sensors.values()} & vehicle.engine.inbox.waiting()
-            pair.tick(waiting=bool(waiting))
+            pair.tick(now_s, waiting=bool(waiting))
     assert vehicle.observations["0-0"].finished == [BEGIN_NS + 20 * HZ10_NS + 1]
     assert vehicle.observations["1-1"].finished == []
 
@@ -398,7 +400,7 @@ def test_frames_of_a_slice_that_silence_has_finished_are_counted(
     for _ in range(400):
         now_s += 0.1
         vehicle.settle()
-        vehicle.pairs["0-0"].tick(waiting=False)
+        vehicle.pairs["0-0"].tick(now_s, waiting=False)
     assert observations.finished == [BEGIN_NS + 50 * HZ10_NS]
     vehicle.drive([comes, comes + 1], 1, 1)
     assert stream.losses().get(("window", "ended_too_early"), 0) == counted

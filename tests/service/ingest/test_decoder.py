@@ -29,7 +29,6 @@ from coec.io.zenoh.bus import InputSample
 from coec.io.zenoh.ros_node import RosTopicList
 from coec.service.api.problems import stream_problems
 from coec.service.ingest.decoder import CAMERA, EGO, LIDAR, RECENT, Decoder, SensorStream
-from coec.service.ingest.frame_buffers import FrameBudget
 from coec.service.ingest.inbox import Inbox, Parcel, Posted
 from support.ros import packed_cloud, transforms
 from support.scenes import ROOF_POSE, sweep_in_frame, turning_sweep
@@ -292,12 +291,10 @@ def test_ego_motion_keeps_to_the_frame_that_it_began_with(bench: Bench) -> None:
 def test_frames_of_two_vehicles_are_not_mixed() -> None:
     stream = SensorStream(CAMERA, "camera-0", PAIR.camera, LimitsConfig())
     used: list[Frame] = []
-    stream.takers = (used.append,)
-    budget = FrameBudget(2**30)
 
     def put(number: int, stamp_ns: int) -> None:
         frame = replace(camera(number), stamp_ns=stamp_ns)
-        stream.take(InputSample(msgpack_frames.encode_camera(frame), MSGPACK), budget)
+        used.extend(stream.take(InputSample(msgpack_frames.encode_camera(frame), MSGPACK), 0.0))
 
     for index in range(30):
         put(index, index * 10**8)
@@ -322,10 +319,9 @@ def test_frames_of_two_vehicles_are_not_mixed() -> None:
 def test_a_sensor_that_is_started_again_loses_no_frame() -> None:
     stream = SensorStream(CAMERA, "camera-0", PAIR.camera, LimitsConfig())
     used: list[Frame] = []
-    stream.takers = (used.append,)
     for number in (*range(1000, 1030), *range(30)):
         payload = msgpack_frames.encode_camera(replace(camera(number), stamp_ns=5 + len(used)))
-        stream.take(InputSample(payload, MSGPACK), FrameBudget(2**30))
+        used += stream.take(InputSample(payload, MSGPACK), 0.0)
     assert [frame.sequence for frame in used] == [*range(1000, 1030), *range(30)]
     assert stream.losses.snapshot() == {}
 

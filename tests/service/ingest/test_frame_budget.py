@@ -7,7 +7,7 @@ import gc
 import numpy as np
 
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, FramePair, ImageFormat, LidarFrame
-from coec.service.ingest.frame_buffers import FrameBudget, frame_bytes
+from coec.service.ingest.pair_stream import FrameBudget, frame_bytes
 
 
 def sweep(points: int) -> LidarFrame:

@@ -7,7 +7,7 @@ import pytest
 
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, Frame, ImageFormat, LidarFrame
 from coec.config import SnippetsConfig
-from coec.service.ingest.frame_buffers import SILENT_S, FrameRing, Snippet, frame_bytes
+from coec.service.ingest.pair_stream import SILENT_S, FrameRing, Snippet, frame_bytes
 
 S = 1_000_000_000
 BEGIN_NS = 1_700_000_000 * S

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from coec.calibration.types import CameraFrame, EncodedImage, FramePair, ImageFormat, LidarFrame
-from coec.service.ingest.frame_buffers import PairBuffer, WaitingFrames, frame_bytes
+from coec.service.ingest.pair_stream import PairBuffer, WaitingFrames, frame_bytes
 
 IMAGE = EncodedImage(ImageFormat.MONO8, 4, 2, bytes(8))
 
@@ -34,7 +34,7 @@ def test_the_oldest_goes_first_and_waits_for_so_many_seconds_and_bytes() -> None
     assert not held.has_waited(111.0)
     held.add(pair(4))
     assert held.has_waited(111.0)
-    assert (held.next_ns, held.take().stamp_ns, len(held)) == (1, 1, 3)
+    assert (held.pairs[0].stamp_ns, held.take().stamp_ns, len(held.pairs)) == (1, 1, 3)
     assert not held.has_waited(111.0)
 
 

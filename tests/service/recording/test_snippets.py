@@ -30,7 +30,7 @@ from coec.io.logs import LossCounter
 from coec.io.mcap.writer import SnippetFile
 from coec.io.recordings.bag import open_bag
 from coec.io.recordings.recording_source import parse_spec
-from coec.service.ingest.frame_buffers import Snippet
+from coec.service.ingest.pair_stream import Snippet
 from coec.service.recording.snippets import SnippetRecorder, SnippetStore
 from support.disk import FullDisk
 from support.readers import read_recording

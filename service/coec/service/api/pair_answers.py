@@ -31,7 +31,7 @@ from coec.service.api import problems, reply_builders
 from coec.service.discovery import info_topic_of
 from coec.service.discovery_listener import NominalStatus
 from coec.service.engine.messages import PairSnapshot
-from coec.service.engine.pair_stream import PairStream
+from coec.service.ingest.pair_stream import PairStream
 from coec.service.recording.recorder import Recorder
 from coec.service.recording.snippets import SNIPPET, SnippetStore
 from coec.service.recording.window_store import WindowStore
@@ -200,7 +200,7 @@ class PairAnswers:
             self._vehicle, rig, known.state, accepted, self.percent_complete, self._config_hash
         )
         own = () if self._recorder.problem is None else (self._recorder.problem,)
-        topics, arrivals = self._context.topics(), self._stream.arrivals()
+        topics, arrivals = self._context.topics(), self._context.vehicle.arrivals(self._stream.sensors)
         changed = self._context.nominal(self.name).changed
         stream_reasons = (
             *problems.stream_problems(report.streams, self._pair, topics),
@@ -384,7 +384,7 @@ class PairAnswers:
             self._stream.losses(),
             self._recorder.recorded,
             self._commands(),
-            self._stream.arrivals(),
+            self._context.vehicle.arrivals(self._stream.sensors),
             self._recorder.waiting,
             has_ego=self._pair.ego is not None,
         )

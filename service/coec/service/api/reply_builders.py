@@ -29,10 +29,11 @@ from coec.schemas.keys import Format
 from coec.schemas.message import to_json, to_msgpack
 from coec.schemas.replies import CalibrationResult
 from coec.service.cpu_budget import BudgetReport
-from coec.service.engine.messages import PairSnapshot, StreamStatistics
+from coec.service.engine.messages import PairSnapshot
 from coec.service.engine.pair import HELD
 from coec.service.ingest.decoder import CAMERA, EGO, LIDAR, StreamCounts
 from coec.service.ingest.inbox import Arrivals
+from coec.service.ingest.pair_stream import StreamStatistics
 from coec.service.timing import NS_PER_S
 from coec.service.worker import compilation
 from coec.service.worker.supervisor import Worker, WorkerState

@@ -17,6 +17,7 @@ from coec.io.logs import LossCounter
 from coec.service.cpu_budget import Budget
 from coec.service.engine import messages
 from coec.service.engine.rig import RigMember
+from coec.service.ingest.pair_stream import SelectionStatistics
 from coec.service.recording.recorder import RecordBetween, RecordPair
 from coec.service.recording.window_store import start_ns_of
 from coec.service.records.pair_store import ServedExtrinsic
@@ -86,9 +87,9 @@ class FrameSelector:
         self._logged_s = -PROGRESS_S
 
     @property
-    def statistics(self) -> messages.SelectionStatistics:
+    def statistics(self) -> SelectionStatistics:
         """What was selected so far."""
-        return messages.SelectionStatistics(
+        return SelectionStatistics(
             self._cutter.selected,
             tuple((cause, count) for cause, count in self._cutter.rejections.items() if count),
             self._cutter.last_quality,

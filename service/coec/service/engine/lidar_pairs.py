@@ -6,7 +6,7 @@ same at any rate. The rig waits for everything that counts by its sensor time (`
 """
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
@@ -33,7 +33,7 @@ from coec.service.engine.rig import (
 )
 from coec.service.engine.schedule import Request, Schedule
 from coec.service.engine.vehicle import Vehicle
-from coec.service.ingest.decoder import EGO, LIDAR, SensorStream
+from coec.service.ingest.decoder import EGO, LIDAR, SensorStream, Taker
 from coec.service.timing import NS_PER_S
 from coec.service.worker import worker_jobs
 from coec.service.worker.supervisor import Worker
@@ -220,11 +220,11 @@ class LidarPairStream:
 
     # --- frames -----------------------------------------------------------------------------------------------------
 
-    def taker(self, name: str) -> Callable[[Frame], None]:
+    def taker(self, name: str) -> Taker:
         """The function that takes the frames of one of its streams."""
         return {"a": self._take_a, "b": self._take_b, EGO: self._take_motion}[name]
 
-    def _take_a(self, frame: Frame) -> None:
+    def _take_a(self, frame: Frame, _: float) -> None:
         assert isinstance(frame, LidarFrame)
         before_ns = self._sampler.latest_ns
         sampled = self._sampler.push_a(frame)
@@ -236,11 +236,11 @@ class LidarPairStream:
         self._hold(sampled)
         self._report_time(now_ns)
 
-    def _take_b(self, frame: Frame) -> None:
+    def _take_b(self, frame: Frame, _: float) -> None:
         assert isinstance(frame, LidarFrame)
         self._hold(self._sampler.push_b(frame))
 
-    def _take_motion(self, frame: Frame) -> None:
+    def _take_motion(self, frame: Frame, _: float) -> None:
         assert isinstance(frame, EgoMotion)
         self._hold(self._sampler.push_motion(frame))
 
@@ -287,7 +287,7 @@ class LidarPairStream:
         self._sweep_sets.popleft()
         return True
 
-    def tick(self, *, waiting: bool) -> None:
+    def tick(self, now_s: float, *, waiting: bool) -> None:
         """Nothing here waits for a clock: the worker answers every job by its deadline."""
 
     def _submit(self, sweep_set: lidar_sampling.SweepSet) -> None:

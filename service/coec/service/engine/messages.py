@@ -4,19 +4,19 @@ An action says what is to be done outside; who does it is `camera_lidar_pair.Cam
 carries the subject of the event by which its outcome comes back.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from coec.calibration.baseline import BaselineDrift
 from coec.calibration.frames.window import CarriedOverPairs, SliceClosed
 from coec.calibration.state import PairState
-from coec.calibration.types import CameraFrame, FramePair, ImageQuality, Matrix4, Reason
+from coec.calibration.types import CameraFrame, FramePair, Matrix4, Reason
 from coec.config import CalibrationConfig, PairConfig
 from coec.schemas.replies import CheckReply
 from coec.service.engine.rig import PairCorrection
 from coec.service.engine.schedule import Request, Schedule
-from coec.service.ingest.decoder import StreamCounts
+from coec.service.ingest.pair_stream import StreamStatistics
 from coec.service.recording.recorder import RecordBetween, RecordPair, WindowLost, WindowRecorded
 from coec.service.records.incidents import Side
 from coec.service.records.pair_store import ServedExtrinsic
@@ -80,60 +80,6 @@ PairResult = JobOutcome | PairCorrection | Reason
 PairSubject = CheckSubject | WindowSubject | PairCorrection
 PairRequest = Request[PairSubject, PairResult, SelectionChange]
 PairSchedule = Schedule[PairSubject, PairResult, SelectionChange]
-
-
-@dataclass(frozen=True, slots=True)
-class SelectionStatistics:
-    """What was selected so far.
-
-    Attributes:
-        selected: number of frame pairs in the open slice.
-        rejections: number of frame pairs that were evaluated for a window and refused, by reason.
-        quality: quality of the latest image that was evaluated; None before the first.
-        frozen: whether images have repeated since the last selected one.
-        checks: number of checks that were requested.
-        not_afforded: number of checks that never got their turn.
-        last_ns: stamp of the latest frame pair that was evaluated; None before the first.
-        steps_back: how often sensor time has stepped back.
-        unanswered: number of checks and windows without a result.
-    """
-
-    selected: int = 0
-    rejections: tuple[tuple[str, int], ...] = ()
-    quality: ImageQuality | None = None
-    frozen: bool = False
-    checks: int = 0
-    not_afforded: int = 0
-    last_ns: int | None = None
-    steps_back: int = 0
-    unanswered: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class StreamStatistics:
-    """Counters since the start, and the latest figures.
-
-    Attributes:
-        streams: samples and frames, by stream.
-        unpaired: number of frames that got into no frame pair, by `<stream>_<cause>`.
-        pairs: number of frame pairs that were formed.
-        held: how many of these wait to be evaluated.
-        selection: what was selected from the others.
-        rate_hz: frame pairs per second of sensor time; 0 when the streams have stopped, None before the second pair.
-        pace: seconds of sensor time per second; None before the second pair.
-        sync_error_s: how much later than its sweep the latest camera frame was taken.
-        timed_by: how the times of the latest sweep's points were read, see `LidarFrame`.
-    """
-
-    streams: dict[str, StreamCounts] = field(default_factory=dict)
-    unpaired: dict[str, int] = field(default_factory=dict)
-    pairs: int = 0
-    held: int = 0
-    selection: SelectionStatistics = field(default_factory=SelectionStatistics)
-    rate_hz: float | None = None
-    pace: float | None = None
-    sync_error_s: float | None = None
-    timed_by: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,6 +31,7 @@ from coec.service.engine import messages
 from coec.service.engine.check_progress import Attempts, CheckProgress
 from coec.service.engine.frame_selector import GRACE_S, FrameSelector
 from coec.service.engine.rig import PairCorrection, RigMember
+from coec.service.ingest.pair_stream import StreamStatistics
 from coec.service.recording.recorder import WindowLost, WindowRecorded
 from coec.service.recording.window_store import WindowVersion, start_ns_of
 from coec.service.records.pair_store import PairStore, StateTransition
@@ -101,7 +102,7 @@ class Pair:
         self._member = member
         self._losses = losses
         self._clock = clock
-        self._statistics = messages.StreamStatistics()
+        self._statistics = StreamStatistics()
         self._clocks_checked_s = self._counted_s = clock.monotonic_s()
         selector.tick(self._counted_s)
         self._progress = CheckProgress(pair.monitor.period_s, clock.monotonic_s(), self._statistics)

@@ -10,16 +10,15 @@ which they came, frames are handed on without a lock, and what a turn does depen
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-from coec.calibration.types import Frame
 from coec.config import KnownStreamConfig, LimitsConfig, PairConfig
 from coec.io.system import ServiceThread
 from coec.io.zenoh.bus import InputSample
 from coec.service.cpu_budget import Budget
 from coec.service.engine.messages import JobDone, JobSubject
 from coec.service.engine.rig import RigEstimator, RigSnapshot
-from coec.service.ingest.decoder import SensorStream, read_alike
-from coec.service.ingest.frame_buffers import FrameBudget, WaitingFrames
+from coec.service.ingest.decoder import SensorStream, Taker, read_alike
 from coec.service.ingest.inbox import Arrivals, Inbox, Parcel, Posted
+from coec.service.ingest.pair_stream import FrameBudget, WaitingFrames
 from coec.service.timing import Clock
 from coec.service.worker.worker_jobs import JobOutcome
 
@@ -56,7 +55,7 @@ class Receiver(Protocol):
     def unanswered(self) -> int:
         """Number of requests to the worker that have no result."""
 
-    def taker(self, name: str) -> Callable[[Frame], None]:
+    def taker(self, name: str) -> Taker:
         """The function that takes the frames of one of its streams."""
 
     def on_event(self, event: Any) -> object:
@@ -65,7 +64,7 @@ class Receiver(Protocol):
     def advance(self, now_s: float) -> bool:
         """Evaluates the next frames if nothing is missing before; returns whether it did. `now_s`: steady clock."""
 
-    def tick(self, *, waiting: bool) -> None:
+    def tick(self, now_s: float, *, waiting: bool) -> None:
         """Time has passed; `waiting`: samples of its streams are in the inbox."""
 
 
@@ -75,6 +74,7 @@ class Vehicle:
 
     Attributes:
         waiting_frames: frames of the pairs that have come and wait to be evaluated.
+        is_busy: the last turn did something after which there may be more to do, so the next one waits for nothing.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class Vehicle:
         tight = reserved_bytes + round(TIGHT * limits.max_held_bytes)
         self.waiting_frames = WaitingFrames(limits.max_held_bytes, lambda: frames.bytes > tight)
         self._receivers: dict[str, Receiver] = {}
-        self._is_busy = True
+        self.is_busy = True
         self._ticked_s = self._rig_ticked_s = 0.0
 
     def request_stop(self) -> None:
@@ -125,7 +125,7 @@ class Vehicle:
         """A stream of this kind: an existing one that reads the same, else a new one."""
         alike = read_alike(kind, stream)
         if alike not in self._sensors:
-            sensor = SensorStream(kind, f"{kind}-{len(self._sensors)}", stream, self._limits, self.clock.monotonic_s)
+            sensor = SensorStream(kind, f"{kind}-{len(self._sensors)}", stream, self._limits)
             self._by_number[sensor.number] = sensor
             self.inbox.open(sensor.number, sensor.depth)
             self._unsubscribed.append(sensor)
@@ -165,21 +165,27 @@ class Vehicle:
 
     def turn(self, idle_s: float) -> bool:
         """Does one turn; waits up to `idle_s` if there is nothing to do. Returns whether there was."""
-        item = self.inbox.take(0.0 if self._is_busy else idle_s)
+        item = self.inbox.take(0.0 if self.is_busy else idle_s)
+        now_s = self.clock.monotonic_s()
         if isinstance(item, Parcel):
-            self._by_number[item.stream].take(item.sample, self._frames)
+            sensor = self._by_number[item.stream]
+            for frame in sensor.take(item.sample, now_s):
+                if not self._frames.admit(frame):
+                    sensor.losses.add(sensor.kind, "memory_full")
+                    continue
+                for taker in sensor.takers:
+                    taker(frame, now_s)
         elif item is not None:
             self._deliver(item)
-        self._is_busy = False
-        now_s = self.clock.monotonic_s()
+        self.is_busy = False
         for receiver in self._receivers.values():
-            self._is_busy |= receiver.advance(now_s)
+            self.is_busy |= receiver.advance(now_s)
         while self.rig.has_news and self.rig.take_report(all_are_silent=self.rig.is_quiet and self.unanswered == 0):
-            self._is_busy = True
+            self.is_busy = True
             self._on_rig(self.rig.snapshot)
         if now_s - self._ticked_s >= TICK_S:
             self._tick(now_s)
-        return item is not None or self._is_busy
+        return item is not None or self.is_busy
 
     @property
     def unanswered(self) -> int:
@@ -211,9 +217,9 @@ class Vehicle:
             self.rig.tick()
         waiting = self.inbox.waiting()
         for sensor in self.sensors:
-            sensor.log.tick()
+            sensor.log.tick(now_s)
         for receiver in self._receivers.values():
-            receiver.tick(waiting=any(sensor.number in waiting for sensor in receiver.sensors.values()))
+            receiver.tick(now_s, waiting=any(sensor.number in waiting for sensor in receiver.sensors.values()))
 
     def finish(self) -> None:
         """Takes all events that were posted, and all reports to the rig; for the end of the service, after that of the

@@ -41,7 +41,6 @@ from coec.io.ros import message_decoding, messages
 from coec.io.ros.transforms import MovingFrame
 from coec.io.ros.wire_format import MessageAttachment
 from coec.io.zenoh.bus import CDR, InputSample
-from coec.service.ingest.frame_buffers import FrameBudget
 from coec.service.timing import NS_PER_S, QUICK_S, Histogram
 
 MAX_GAP = 100_000
@@ -571,20 +570,18 @@ QUIET_S = 60.0
 class StreamLog:
     """Belongs to the thread of the engine."""
 
-    def __init__(self, kind: str, sensor: str, clock: Callable[[], float] = time.monotonic) -> None:
-        """`kind`: `camera`, `lidar` or `ego`. `sensor`: its name for people. `clock`: a steady clock, s."""
+    def __init__(self, kind: str, sensor: str) -> None:
+        """`kind`: `camera`, `lidar` or `ego`. `sensor`: its name for people."""
         self._kind = kind
         self._fields = {"stream": kind, "sensor": sensor}
-        self._clock = clock
         self._frames = 0
         self._first_ns = 0
         self._latest_s = 0.0
         self._reported_s = -QUIET_S
         self._silent_since_s: float | None = None
 
-    def push(self, frame: Frame) -> None:
-        """A frame was accepted."""
-        self._latest_s = self._clock()
+    def push(self, frame: Frame, now_s: float) -> None:
+        """A frame was accepted. `now_s`: steady clock, s."""
         self._frames += 1
         if self._frames == 1:
             self._first_ns = frame.stamp_ns
@@ -593,13 +590,13 @@ class StreamLog:
             rate_hz = (RATE_FRAMES - 1) * NS_PER_S / (frame.stamp_ns - self._first_ns)
             _log.info(f"{self._kind} frames arrive at {rate_hz:.1f} Hz by their stamps", extra={"fields": self._fields})
         if self._silent_since_s is not None:
-            silent_s = self._latest_s - self._silent_since_s
+            silent_s = now_s - self._silent_since_s
             self._silent_since_s = None
             _log.info(f"{self._kind} frames arrive again after {silent_s:.0f} s", extra={"fields": self._fields})
+        self._latest_s = now_s
 
-    def tick(self) -> None:
-        """Time has passed."""
-        now_s = self._clock()
+    def tick(self, now_s: float) -> None:
+        """Time has passed. `now_s`: steady clock, s."""
         if not self._frames or self._silent_since_s is not None or now_s - self._latest_s < SILENT_S:
             return
         if now_s - self._reported_s >= QUIET_S:
@@ -633,6 +630,10 @@ def read_alike(kind: str, stream: KnownStreamConfig) -> tuple[str, str]:
     return kind, stream.model_dump_json(exclude=set(READ_WITHOUT))
 
 
+Taker = Callable[[Frame, float], None]
+"""Takes a frame, and the time of the steady clock at which it came, s."""
+
+
 class SensorStream:
     """One stream. `counts` and `losses` are for any thread, everything else is for the thread of the engine.
 
@@ -641,25 +642,18 @@ class SensorStream:
         number: name of the stream in the inbox.
         log: its lines in the log.
         took: how long the decoding of each sample took.
-        takers: functions that get each frame, in the order in which the frames came.
+        takers: functions that are to get each frame, in the order in which the frames came.
     """
 
-    def __init__(
-        self,
-        kind: str,
-        number: str,
-        config: KnownStreamConfig,
-        limits: LimitsConfig,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, kind: str, number: str, config: KnownStreamConfig, limits: LimitsConfig) -> None:
         self.kind = kind
         self.number = number
         self.config = config
         self.losses = LossCounter(_log, config.sensor, "sensor")
         self.decoder = Decoder(kind, config, limits, self.losses)
-        self.log = StreamLog(kind, config.sensor, clock)
+        self.log = StreamLog(kind, config.sensor)
         self.took = Histogram(QUICK_S)
-        self.takers: tuple[Callable[[Frame], None], ...] = ()
+        self.takers: tuple[Taker, ...] = ()
         self._on_trial: list[Frame] = []
 
     @property
@@ -667,28 +661,22 @@ class SensorStream:
         """How many samples may wait."""
         return MOTIONS_WAITING if self.kind == EGO else FRAMES_WAITING
 
-    def take(self, sample: InputSample, budget: FrameBudget) -> None:
-        """Decodes a sample and hands the same frame to every taker. The first frames of a new sender are kept back
+    def take(self, sample: InputSample, now_s: float) -> list[Frame]:
+        """Decodes a sample; returns the frames that may be used now. The first frames of a new sender are kept back
         until it has sent some in a row: if the sender before comes back, two are sending, and the frames of neither may
-        be used."""
+        be used. `now_s`: steady clock, s."""
         started_s = time.monotonic()
         frame = self.decoder.frame(sample)
-        self.took.add(time.monotonic() - started_s, self.kind)
+        if frame is not None:
+            self._on_trial.append(frame)
+        usable: list[Frame] = []
         if self.decoder.contested:
             if self._on_trial:
                 self.losses.add(self.kind, TWO_SENDERS, len(self._on_trial))
                 self._on_trial.clear()
-            return
-        if frame is None:
-            return
-        self._on_trial.append(frame)
-        if self.decoder.on_trial:
-            return
-        frames, self._on_trial = self._on_trial, []
-        for each in frames:
-            self.log.push(each)
-            if not budget.admit(each):
-                self.losses.add(self.kind, "memory_full")
-                continue
-            for taker in self.takers:
-                taker(each)
+        elif not self.decoder.on_trial:
+            usable, self._on_trial = self._on_trial, usable
+        for each in usable:
+            self.log.push(each, now_s)
+        self.took.add(time.monotonic() - started_s, self.kind)
+        return usable

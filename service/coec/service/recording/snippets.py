@@ -26,7 +26,7 @@ from coec.io.mcap.writer import PART_SUFFIX, REWRITE_SUFFIX, SnippetFile, metada
 from coec.io.storage import read_piece
 from coec.schemas.message import from_json, to_json
 from coec.schemas.replies import SnippetInfo
-from coec.service.ingest.frame_buffers import Snippet, frame_bytes
+from coec.service.ingest.pair_stream import Snippet, frame_bytes
 
 _log = logging.getLogger(__name__)
 
