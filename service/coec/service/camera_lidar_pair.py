@@ -143,7 +143,7 @@ class CameraLidarPair:
         stamp_ns = held.pairs[0].camera.stamp_ns
         self.engine.warms_up = self._context.worker.warms_up
         self._step(messages.SensorTime(stamp_ns))
-        is_forced = not self.recorder.has_room or self.engine.waits(stamp_ns)
+        is_forced = not self.recorder.has_room or self.engine.is_waiting
         if not is_forced:
             held.stop_waiting()
         elif not held.has_waited(now_s):
@@ -179,7 +179,9 @@ class CameraLidarPair:
         self._do([] if closed is None else [closed])
 
     def _step(self, event: messages.Event) -> None:
-        self._do(self.engine.step(event))
+        actions = self.engine.step(event)
+        if actions:
+            self._do(actions)
 
     # --- actions ----------------------------------------------------------------------------------------------------
 

@@ -474,7 +474,7 @@ class DriveReplay:
         while self._vehicle.turn(0.0) or pair.stream.held.pairs:
             if not pair.stream.held.pairs:
                 continue
-            if pair.engine.oldest_request is not None and pair.engine.waits(pair.stream.held.pairs[0].stamp_ns):
+            if pair.engine.oldest_request is not None and pair.engine.is_waiting:
                 self._deliver_oldest(pair.engine.oldest_request)
             elif not pair.recorder.has_room:
                 time.sleep(POLL_S)  # the disk is slower than the replay

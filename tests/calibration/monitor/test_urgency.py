@@ -40,13 +40,14 @@ class Drive:
         for i in range(round((end_s - begin_s) * self.rate_hz)):
             second = begin_s + i / self.rate_hz
             pair = self.at(round(second * S))
-            ends += [(second, e) for e in self.urgency.apply(self.cutter, self.rate_hz)]
+            self.urgency.observe(pair.stamp_ns)
+            ends += [(second, e) for e in self.urgency.apply(self.cutter)]
             for event in self.cutter.offer(pair, self.street.T_camera_lidar_start):
                 if isinstance(event, PairSelected):
                     self.selected.append(second)
                 elif isinstance(event, SliceClosed):
                     ends.append((second, event))
-                    self.urgency.on_slice_closed(event, self.cutter, self.rate_hz)
+                    self.urgency.on_slice_closed(event, self.cutter)
         return ends
 
     def at(self, stamp_ns: int) -> FramePair:

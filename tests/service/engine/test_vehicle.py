@@ -75,10 +75,6 @@ class Observations:
         del monotonic_s
         return False
 
-    def waits(self, stamp_ns: int) -> bool:
-        del stamp_ns
-        return self.is_waiting
-
     def step(self, event: Event) -> list[Action]:
         if isinstance(event, Evaluate):
             self.statistics = replace(self.statistics, last_ns=event.pair.stamp_ns)

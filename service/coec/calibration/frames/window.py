@@ -19,7 +19,7 @@ An open slice that began before the mount moved mixes two extrinsics, so it is e
 began later is ended as soon as it is enough for a window, or replaced by a short dense one if that comes sooner.
 """
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -84,12 +84,13 @@ class BetweenPairs:
         if self._open is not None:
             self._open.next_ns = stamp_ns + self._open.spacing_ns
 
-    def offer(self, pair: FramePair, T_camera_lidar: Matrix4) -> FramePair | None:
-        """The pair, thinned, if it is to be recorded; `T_camera_lidar` (4, 4) is the current extrinsic."""
+    def offer(self, pair: FramePair, stamp_ns: int, T_camera_lidar: Matrix4) -> FramePair | None:
+        """The pair of this stamp, thinned, if it is to be recorded; `T_camera_lidar` (4, 4) is the current
+        extrinsic."""
         current = self._open
-        if current is None or current.next_ns is None or pair.stamp_ns < max(current.next_ns, current.afforded_ns):
+        if current is None or current.next_ns is None or stamp_ns < max(current.next_ns, current.afforded_ns):
             return None
-        current.next_ns = pair.stamp_ns + current.spacing_ns
+        current.next_ns = stamp_ns + current.spacing_ns
         try:
             camera = self._images.reduced(pair.camera)
         except DecodeError:
@@ -179,13 +180,13 @@ class CheckSampler:
 
     def offer(self, pair: FramePair) -> tuple[FramePair, ...] | None:
         """Takes the next pair. Returns the pairs of a check, newest last, if a period has ended with enough of them."""
-        stamp_ns = pair.stamp_ns
+        stamp_ns = pair.camera.stamp_ns
         if stamp_ns < self._last_ns:  # sensor time stepped back
             self._pairs.clear()
             self._new = 0
         self._last_ns = stamp_ns
         oldest_ns = stamp_ns - SPAN_PERIODS * self._period_ns
-        self._pairs = [earlier for earlier in self._pairs if earlier.stamp_ns >= oldest_ns]
+        self._pairs = [earlier for earlier in self._pairs if earlier.camera.stamp_ns >= oldest_ns]
         period, cell = stamp_ns // self._period_ns, stamp_ns * self._config.pairs // self._period_ns
         check = None
         if period != self._period and self._new > 0 and len(self._pairs) >= self._config.min_pairs:
@@ -278,6 +279,7 @@ class WindowCutter:
     """Cuts the stream of one camera-LiDAR pair into slices and picks the pairs of each.
 
     Attributes:
+        slice_end_ns: sensor time at which the open slice ends; None when none is open.
         rejections: number of pairs that were inspected and refused, by reason.
         last_quality: result of the last inspection of an image.
     """
@@ -292,6 +294,7 @@ class WindowCutter:
         self._hurried_ns: int | None = None
         self._open: _Slice | None = None
         self._carried_over: CarriedOverPairs | None = None
+        self.slice_end_ns: int | None = None
         self.rejections: Counter[str] = Counter()
         self.last_quality: ImageQuality | None = None
 
@@ -310,11 +313,6 @@ class WindowCutter:
         return len(self._open.filled) + self._carried_over_pairs if self._open else 0
 
     @property
-    def slice_end_ns(self) -> int | None:
-        """Sensor time at which the open slice ends; None when none is open."""
-        return self._open.start_ns + self._open.length_ns if self._open else None
-
-    @property
     def slice_start_ns(self) -> int | None:
         """Stamp of the pair that opened the slice; None when none is open."""
         return self._open.start_ns if self._open else None
@@ -322,21 +320,23 @@ class WindowCutter:
     def offer(self, pair: FramePair, T_camera_lidar: Matrix4) -> list[WindowEvent]:
         """Takes the next pair; `T_camera_lidar` (4, 4) is the current extrinsic, at which its points must be in view. A
         slice with kept pairs ends as soon as it has as many pairs as any slice."""
-        events: list[WindowEvent] = [*self._end_before(pair.stamp_ns)]
+        stamp_ns = pair.camera.stamp_ns
+        events: list[WindowEvent] = [*self._end_before(stamp_ns)]
         if self._open is None:
-            events += self._forget_before(pair.stamp_ns)
-            window_id = f"{self._rig.pair}-{pair.stamp_ns}"
+            events += self._forget_before(stamp_ns)
+            window_id = f"{self._rig.pair}-{stamp_ns}"
             self._config = self._next_config
             length_ns = self._hurried_ns or round(self._config.slice_s * NS_PER_S)
-            self._open = _Slice(window_id, pair.stamp_ns, length_ns, set(), pair.stamp_ns)
-            self._between.begin(self._config, pair.stamp_ns, length_ns)
+            self._open = _Slice(window_id, stamp_ns, length_ns, set(), stamp_ns)
+            self.slice_end_ns = stamp_ns + length_ns
+            self._between.begin(self._config, stamp_ns, length_ns)
             self._hurried_ns = None
-        if self._select(self._open, pair, T_camera_lidar):
-            self._between.on_selected(pair.stamp_ns)
+        if self._select(self._open, pair, stamp_ns, T_camera_lidar):
+            self._between.on_selected(stamp_ns)
             events.append(PairSelected(self._open.window_id, pair, first=len(self._open.filled) == 1))
             if self._carried_over is not None and self.selected >= self._config.pairs:
                 events += self.finish()
-        elif (between := self._between.offer(pair, T_camera_lidar)) is not None:
+        elif (between := self._between.offer(pair, stamp_ns, T_camera_lidar)) is not None:
             events.append(PairBetween(self._open.window_id, between))
         return events
 
@@ -357,7 +357,7 @@ class WindowCutter:
     def finish(self) -> list[SliceClosed]:
         """Ends the open slice now. If it has too few pairs for a window, the kept pairs stay for the next one."""
         closed, pairs, carried_over = self._open, self.selected, self._carried_over
-        self._open = None
+        self._open = self.slice_end_ns = None
         if closed is None or not closed.filled:
             return []
         complete = pairs >= self._config.min_pairs
@@ -384,18 +384,18 @@ class WindowCutter:
             return []
         return self.finish()
 
-    def _select(self, current: _Slice, pair: FramePair, T_camera_lidar: Matrix4) -> bool:
+    def _select(self, current: _Slice, pair: FramePair, stamp_ns: int, T_camera_lidar: Matrix4) -> bool:
         bin_ns = current.length_ns // self._config.pairs
-        index = min((pair.stamp_ns - current.start_ns) // bin_ns, self._config.pairs - 1)
-        if index in current.filled or pair.stamp_ns < current.next_inspection_ns:
+        index = min((stamp_ns - current.start_ns) // bin_ns, self._config.pairs - 1)
+        if index in current.filled or stamp_ns < current.next_inspection_ns:
             return False
         reason = self._objection(pair, T_camera_lidar)
         if reason is not None:
             self.rejections[reason] += 1
-            current.next_inspection_ns = pair.stamp_ns + bin_ns // INSPECTIONS_PER_BIN
+            current.next_inspection_ns = stamp_ns + bin_ns // INSPECTIONS_PER_BIN
             return False
         current.filled.add(index)
-        current.next_inspection_ns = pair.stamp_ns + bin_ns // 2
+        current.next_inspection_ns = stamp_ns + bin_ns // 2
         return True
 
     def _objection(self, pair: FramePair, T_camera_lidar: Matrix4) -> str | None:
@@ -459,6 +459,9 @@ def _half_view_rad(in_view: NDArray[np.bool_]) -> float:
 TRIES = 3
 """Urgent windows per suspicion: if these do not help, more of them will not either."""
 
+RATE_PAIRS = 32
+"""Number of pairs from which the rate is taken at which they come: three seconds at 10 Hz."""
+
 MARGIN = 1.2
 """Factor by which a slice is longer than its pairs need at the rate at which they come."""
 
@@ -468,6 +471,7 @@ class UrgentWindow:
 
     def __init__(self, monitor: MonitorConfig) -> None:
         self._monitor = monitor
+        self._stamps_ns: deque[int] = deque(maxlen=RATE_PAIRS)
         self._since_ns: int | None = None
         self._tries = 0
         self._hurried = False
@@ -507,19 +511,21 @@ class UrgentWindow:
         self._since_ns, self._hurried = since_ns, False
         self._for_rig, self._longer_s = for_rig, longer_s
 
-    def apply(self, cutter: WindowCutter, rate_hz: float | None) -> list[SliceClosed]:
-        """Ends the slice of the cutter if necessary; to be called before a pair is offered to the cutter.
+    def observe(self, stamp_ns: int) -> None:
+        """A pair with this stamp came. A stamp that steps back starts anew."""
+        if self._stamps_ns and stamp_ns <= self._stamps_ns[-1]:
+            self._stamps_ns.clear()
+        self._stamps_ns.append(stamp_ns)
 
-        Args:
-            rate_hz: at which pairs come; None while unknown.
-        """
+    def apply(self, cutter: WindowCutter) -> list[SliceClosed]:
+        """Ends the slice of the cutter if necessary; to be called before a pair is offered to the cutter."""
         if self._since_ns is None:
             return []
         start_ns, enough = cutter.slice_start_ns, cutter.selected >= cutter.config.min_pairs
         if start_ns is None:
-            return self._hurry(cutter, rate_hz)
+            return self._hurry(cutter)
         if start_ns < self._since_ns:
-            return self._hurry(cutter, rate_hz)
+            return self._hurry(cutter)
         if self._hurried:
             return []
         if enough:
@@ -527,9 +533,9 @@ class UrgentWindow:
             return cutter.finish()
         lacking = cutter.config.min_pairs - cutter.selected
         waits_s = lacking * cutter.config.slice_s / cutter.config.pairs
-        return [] if waits_s <= self._length_s(cutter.config, rate_hz) else self._hurry(cutter, rate_hz)
+        return [] if waits_s <= self._length_s(cutter.config) else self._hurry(cutter)
 
-    def on_slice_closed(self, event: SliceClosed, cutter: WindowCutter, rate_hz: float | None) -> None:
+    def on_slice_closed(self, event: SliceClosed, cutter: WindowCutter) -> None:
         """A slice ended by itself. If it has enough pairs it is the window that was wanted; else the next one is
         hurried."""
         if self._since_ns is None or not self._hurried:
@@ -537,15 +543,18 @@ class UrgentWindow:
         if event.complete:
             self._since_ns = None
         else:
-            cutter.hurry(self._length_s(cutter.config, rate_hz))
+            cutter.hurry(self._length_s(cutter.config))
 
-    def _hurry(self, cutter: WindowCutter, rate_hz: float | None) -> list[SliceClosed]:
+    def _hurry(self, cutter: WindowCutter) -> list[SliceClosed]:
         closed = cutter.finish()
-        cutter.hurry(self._length_s(cutter.config, rate_hz))
+        cutter.hurry(self._length_s(cutter.config))
         self._hurried = True
         return closed
 
-    def _length_s(self, window: WindowConfig, rate_hz: float | None) -> float:
+    def _length_s(self, window: WindowConfig) -> float:
         """Length of an urgent slice: as configured, or longer if pairs come slowly, but no longer than any other."""
-        needed_s = MARGIN * window.pairs / rate_hz if rate_hz else 0.0
+        seen, needed_s = self._stamps_ns, 0.0
+        if len(seen) > 1:
+            rate_hz = (len(seen) - 1) * NS_PER_S / (seen[-1] - seen[0])
+            needed_s = MARGIN * window.pairs / rate_hz
         return min(max(self._monitor.urgent_slice_s, needed_s) + self._longer_s, window.slice_s)

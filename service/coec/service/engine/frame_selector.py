@@ -21,7 +21,7 @@ from coec.service.ingest.pair_stream import SelectionStatistics
 from coec.service.recording.recorder import RecordBetween, RecordPair
 from coec.service.recording.window_store import start_ns_of
 from coec.service.records.pair_store import ServedExtrinsic
-from coec.service.timing import NS_PER_S, SensorClock
+from coec.service.timing import NS_PER_S
 from coec.service.worker.worker_jobs import DEADLINE_S, Kind
 
 _log = logging.getLogger(__name__)
@@ -75,7 +75,6 @@ class FrameSelector:
             self._cutter.carry_over(carried_over)
         self._sampler = window.CheckSampler(pair.monitor)
         self._urgency = window.UrgentWindow(pair.monitor)
-        self._pace = SensorClock()
         self._waiting_checks: deque[tuple[FramePair, ...]] = deque(maxlen=CHECKS_WAITING)
         self._waits_its_turn = False
         self._suspected = False
@@ -133,7 +132,7 @@ class FrameSelector:
 
     def select(self, pair: FramePair) -> list[messages.Action]:
         """Evaluates the next frame pair and uses it for the window, for a check, or not at all."""
-        stamp_ns = pair.stamp_ns
+        stamp_ns = pair.camera.stamp_ns
         actions: list[messages.Action] = []
         if self.is_step_back(stamp_ns):
             self._schedule.bring_forward(stamp_ns)
@@ -144,17 +143,21 @@ class FrameSelector:
                 actions += self.end_slice()
             actions += self._apply_due(stamp_ns)
         self._last_ns = stamp_ns
-        # No steady clock is given, because this `SensorClock` only measures the rate at which frame pairs come.
-        self._pace.observe(stamp_ns, 0.0)
         self._follow_budget()
         self._follow_rig(stamp_ns)
-        for closed in self._urgency.apply(self._cutter, self._pace.rate_hz):
-            actions.append(self._close(closed, stamp_ns))
-        actions += self._offer_to_window(pair)
+        frozen_before = self._cutter.rejections["frozen"]
+        self._urgency.observe(stamp_ns)
+        urgent = self._urgency.apply(self._cutter)
+        events = self._cutter.offer(pair, self._served.T_camera_lidar)
         check = self._sampler.offer(pair)
+        for closed in urgent:
+            actions.append(self._close(closed, stamp_ns))
+        for event in events:
+            actions += self._on_window_event(event, stamp_ns)
+        self._frozen |= self._cutter.rejections["frozen"] > frozen_before
         if check is not None:
             self._await_turn(check)
-        if stamp_ns >= self._window_due_ns:
+        if self._waiting_checks and stamp_ns >= self._window_due_ns:
             actions += self._submit_checks(stamp_ns)
         return actions
 
@@ -165,11 +168,10 @@ class FrameSelector:
         if end_ns is None:
             return []
         actions = self._apply_due(end_ns)
-        for closed in self._urgency.apply(self._cutter, self._pace.rate_hz):
+        for closed in self._urgency.apply(self._cutter):
             actions.append(self._close(closed, end_ns))
         for closed in self._cutter.advance(end_ns):
-            actions.append(self._close(closed, end_ns))
-            self._urgency.on_slice_closed(closed, self._cutter, self._pace.rate_hz)
+            actions += self._on_window_event(closed, end_ns)
         return actions
 
     def finish(self) -> window.SliceClosed | None:
@@ -195,7 +197,10 @@ class FrameSelector:
         return [] if change.calibration is None else [messages.UseCalibration(change.calibration)]
 
     def _apply_due(self, stamp_ns: int) -> list[messages.Action]:
-        return [action for change in self._schedule.take_due(stamp_ns) for action in self.apply(change)]
+        actions: list[messages.Action] = []
+        for change in self._schedule.take_due(stamp_ns):
+            actions += self.apply(change)
+        return actions
 
     def _begin_new_time(self, stamp_ns: int) -> None:
         self._steps_back += 1
@@ -222,28 +227,24 @@ class FrameSelector:
         if since_ns is not None and since_ns > self._latest_window_ns and not self._urgency.is_waiting:
             self._urgency.request(since_ns, self._budget.window_turn_s(self._pair.name, stamp_ns))
 
-    def _offer_to_window(self, pair: FramePair) -> list[messages.Action]:
-        actions: list[messages.Action] = []
-        frozen_before = self._cutter.rejections["frozen"]
-        T_camera_lidar = self._served.T_camera_lidar
-        for event in self._cutter.offer(pair, T_camera_lidar):
-            if isinstance(event, window.PairSelected):
+    def _on_window_event(self, event: window.WindowEvent, stamp_ns: int) -> list[messages.Action]:
+        """What is to be done after a frame pair of this stamp was offered to the window."""
+        match event:
+            case window.PairSelected():
                 self._frozen = False
-                actions.append(RecordPair(event.window_id, event.pair, T_camera_lidar))
-                if self._infers:
-                    actions.append(messages.Prefetch(event.pair.camera))
                 self._log_progress(event.window_id)
-            elif isinstance(event, window.PairBetween):
-                actions.append(RecordBetween(event.window_id, event.pair))
-            elif isinstance(event, window.SliceClosed):
-                actions.append(self._close(event, pair.stamp_ns))
-                self._urgency.on_slice_closed(event, self._cutter, self._pace.rate_hz)
-            else:
+                record = RecordPair(event.window_id, event.pair, self._served.T_camera_lidar)
+                return [record, messages.Prefetch(event.pair.camera)] if self._infers else [record]
+            case window.PairBetween():
+                return [RecordBetween(event.window_id, event.pair)]
+            case window.SliceClosed():
+                self._urgency.on_slice_closed(event, self._cutter)
+                return [self._close(event, stamp_ns)]
+            case window.CarriedOverDropped():
                 lost = event.carried_over
                 detail = f"pairs of {lost.window_id} since {lost.since_ns} ns are in no other window"
                 self._losses.add("window", "kept_pairs_forgotten", lost.pairs, detail=detail)
-        self._frozen |= self._cutter.rejections["frozen"] > frozen_before
-        return actions
+                return []
 
     def _await_turn(self, check: tuple[FramePair, ...]) -> None:
         """Queues frame pairs for a check. Those of an earlier period that still wait for their turn are dropped as too

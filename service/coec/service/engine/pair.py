@@ -77,6 +77,8 @@ class Pair:
         selector: its selection of frames.
         warms_up: the worker compiles kernels before it takes jobs. No result is awaited then, because that takes longer
             than frames can be held.
+        is_waiting: frame pairs of the sensor time of the latest `SensorTime` may not be evaluated yet, because a result
+            of the worker or of the rig that counts before them has not come.
     """
 
     def __init__(
@@ -93,7 +95,7 @@ class Pair:
     ) -> None:
         self.store = store
         self.selector = selector
-        self.warms_up = False
+        self.warms_up = self.is_waiting = False
         self._name = pair.name
         self._rules = PairRules(pair.policy, pair.tracker, pair.monitor)
         self._stale_after_s = stale_after_s
@@ -117,14 +119,6 @@ class Pair:
         self._actions: list[messages.Action] = []
 
     # --- for the caller: predicates, which change nothing -----------------------------------------------------------
-
-    def waits(self, stamp_ns: int) -> bool:
-        """Whether a frame pair of this stamp may not be evaluated yet, because a result of the worker or of the rig
-        that counts before it has not come. Asked after the step `SensorTime`, which ends a slice as soon as no result
-        that counts by its end is missing."""
-        if self.selector.ends_slice(stamp_ns) and not self.selector.is_step_back(stamp_ns):
-            return True
-        return self._waits_for_results(stamp_ns) or self._member.waits(stamp_ns)
 
     @property
     def unanswered(self) -> int:
@@ -184,8 +178,12 @@ class Pair:
                 self._tick(event)
             case messages.Reconfigured():
                 self._reconfigure(event)
-        self._note_event()
-        return self.take_actions()
+        before, state = self._health, self.store.state
+        self._health = state.health
+        if state.health is not before and state.health in INCIDENT_STATES:
+            self._actions.append(messages.KeepSnippet(state.health.value, state.T_camera_lidar))
+        actions, self._actions = self._actions, []
+        return actions
 
     def take_actions(self) -> list[messages.Action]:
         """What is to be done since the last step."""
@@ -201,29 +199,29 @@ class Pair:
             self._schedule.bring_forward(stamp_ns)
         elif end_ns is not None and end_ns <= stamp_ns:
             self._follow_rig(end_ns)
-            if self._waits_for_results(end_ns) or self._member.waits(end_ns):
+            if self.is_waiting:
                 return
             self._actions += self.selector.end_slice()
         self._follow_rig(stamp_ns)
 
     def _follow_rig(self, stamp_ns: int) -> None:
-        """Reports to the rig how far the pair has come, and takes its corrections that count by then."""
-        waits = self._waits_for_results(stamp_ns)
+        """Reports to the rig how far the pair has come, and takes its corrections that count by then, unless a result
+        that counts by then has not come."""
+        waits = self._schedule.waits(stamp_ns) and not self.warms_up
         self._member.report_time(stamp_ns, waits=waits)
-        if waits or self._member.waits(stamp_ns):
+        self.is_waiting = waits or self._member.waits(stamp_ns)
+        if self.is_waiting:
             return
         for correction in self._member.corrections(stamp_ns):
             self._answer(self._schedule.submit(correction, correction.from_ns, self._counted_s + GRACE_S), correction)
 
-    def _waits_for_results(self, stamp_ns: int) -> bool:
-        return self._schedule.waits(stamp_ns) and not self.warms_up
-
     def _evaluate(self, pair: FramePair, *, is_forced: bool) -> None:
-        if is_forced and self.waits(pair.stamp_ns):
+        if is_forced and self.is_waiting:
             self._losses.add("monitor", "not_awaited")
-        steps_back = self.selector.is_step_back(pair.stamp_ns)
+        stamp_ns = pair.camera.stamp_ns
+        steps_back = self.selector.is_step_back(stamp_ns)
         if steps_back:
-            self._begin_new_time(pair.stamp_ns)
+            self._begin_new_time(stamp_ns)
         self._actions += self.selector.select(pair)
         since_ns = self.store.state.flagged_since_ns
         if steps_back and since_ns is not None:
@@ -258,14 +256,6 @@ class Pair:
         """Publishes what is known, even if it is not on the disk yet."""
         self.is_unpublished = False
         self._actions.append(messages.Publish(self.snapshot()))
-
-    def _note_event(self) -> None:
-        """If the pair has just entered a state of `INCIDENT_STATES`, the seconds around it are kept. This changes no
-        decision."""
-        before, state = self._health, self.store.state
-        self._health = state.health
-        if state.health is not before and state.health in INCIDENT_STATES:
-            self._actions.append(messages.KeepSnippet(state.health.value, state.T_camera_lidar))
 
     def _reconfigure(self, event: messages.Reconfigured) -> None:
         self._rules = PairRules(event.pair.policy, event.pair.tracker, event.pair.monitor)

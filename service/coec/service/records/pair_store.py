@@ -79,6 +79,7 @@ class PairStore:
     """Keeps the books of one pair.
 
     Attributes:
+        state: the state now; `update` changes it.
         history, incidents: the books themselves.
         damage: why a part of what was found on the disk could not be used; None if all could.
         transitions: number of changes of health, by the state that was entered.
@@ -110,7 +111,7 @@ class PairStore:
         self._epoch = 0
         self._commissioned_from: tuple[str, ...] = ()
         remembered, heads = self._restore()
-        self._state = restored(remembered)
+        self.state = restored(remembered)
         self.history = PairHistory(config.directory, rig.pair, config.history, heads)
         self.incidents = Incidents(config.directory / "evidence", rig.pair, config.evidence)
         self._checks = CheckLog(config.directory / f"checks-{rig.pair}.jsonl", config.checks)
@@ -126,25 +127,20 @@ class PairStore:
             self.history.append(self._entry("chain", "broken", text))
         if self.damage is not None:
             self.save()
-        if self._state.health is not remembered.health:
+        if self.state.health is not remembered.health:
             self._since_ns = self._clock.wall_ns()
-            self._note_health(remembered, self._state, None)
-
-    @property
-    def state(self) -> PairState:
-        """The state now."""
-        return self._state
+            self._note_health(remembered, self.state, None)
 
     @property
     def served(self) -> ServedExtrinsic:
         """What is served now."""
-        return ServedExtrinsic(self._epoch, self._state.T_camera_lidar)
+        return ServedExtrinsic(self._epoch, self.state.T_camera_lidar)
 
     @property
     def carried_over(self) -> CarriedOverPairs | None:
         """Pairs of the latest window that belong to the next one, because the camera moved before they were taken. None
         if there are none, or a window has been recorded since."""
-        latest = self._state.latest
+        latest = self.state.latest
         recorded = self._folder.windows(self._rig.pair)
         if latest is None or not recorded or recorded[-1].stem != latest.window_id:
             return None
@@ -184,11 +180,11 @@ class PairStore:
         """
         if epoch is not None and epoch != self._epoch:
             return None
-        before = self._state
+        before = self.state
         after = step(before)
         record = after.record.watched(self._completed_stamp_ns, stamp_ns) if completed else after.record
         replaced = not np.array_equal(before.T_camera_lidar, after.T_camera_lidar)
-        after = self._state = replace(after, record=record.entered(after.health, replaced=replaced))
+        after = self.state = replace(after, record=record.entered(after.health, replaced=replaced))
         if completed:
             self._completed_s, self._completed_stamp_ns = self._clock.monotonic_s(), stamp_ns
             self.damage = None if self.history.damage is None else self.damage
@@ -253,7 +249,7 @@ class PairStore:
         Raises:
             NotFoundError: no calibration has this name, or the name is ambiguous.
         """
-        served = transform_of(self._state.T_camera_lidar).matrix
+        served = transform_of(self.state.T_camera_lidar).matrix
         results: dict[str, replies.CalibrationResult] = {}
         matches: dict[str, HistoryRecord] = {}
         in_force: HistoryRecord | None = None
@@ -286,7 +282,7 @@ class PairStore:
         completed_ns = None if age_s is None else self._clock.wall_ns() - round(age_s * NS_PER_S)
         clocks = Clocks(completed_ns, self._completed_stamp_ns, self._since_ns)
         heads, windows = self._durable_heads, self._commissioned_from
-        self._store.update(self._rig, self._state, clocks, heads, windows)
+        self._store.update(self._rig, self.state, clocks, heads, windows)
         self._disk_writer.write(self.history, self.incidents, self._store)
 
     def is_on_disk(self) -> bool:
@@ -305,7 +301,7 @@ class PairStore:
             late = state if why_overdue is None else overdue(state, why_overdue)
             return aged(late, silent_s, stale_after_s)
 
-        if passed(self._state) is not self._state:
+        if passed(self.state) is not self.state:
             self.update(passed, None, completed=False)
 
     # --- inside -----------------------------------------------------------------------------------------------------
