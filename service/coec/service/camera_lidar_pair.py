@@ -17,7 +17,7 @@ from coec.service.configuration import settings_hash
 from coec.service.engine import messages
 from coec.service.engine.commands import CommandExecutor, PairCommand, Surroundings
 from coec.service.engine.frame_selector import FrameSelector
-from coec.service.engine.pair import Pair
+from coec.service.engine.pair import TICK_S, Pair
 from coec.service.engine.schedule import Request, Schedule
 from coec.service.ingest.decoder import SensorStream, Taker
 from coec.service.ingest.pair_stream import FrameRing, PairBuffer, PairStream
@@ -135,15 +135,16 @@ class CameraLidarPair:
     def advance(self, now_s: float) -> bool:
         """Evaluates the oldest frame pair if it may be evaluated: every result that counts before it has come and the
         recorder has room; or it has waited too long, or too many frames wait. Returns whether it did."""
-        if self.engine.needs_tick(now_s):
+        engine, held = self.engine, self.stream.held
+        can_publish = engine.is_unpublished and engine.store.may_be_published()
+        if can_publish or now_s - engine.ticked_s >= TICK_S:
             self._tick()
-        held = self.stream.held
         if not held.pairs:
             return False
         stamp_ns = held.pairs[0].camera.stamp_ns
-        self.engine.warms_up = self._context.worker.warms_up
+        engine.warms_up = self._context.worker.warms_up
         self._step(messages.SensorTime(stamp_ns))
-        is_forced = not self.recorder.has_room or self.engine.is_waiting
+        is_forced = not self.recorder.has_room or engine.is_waiting
         if not is_forced:
             held.stop_waiting()
         elif not held.has_waited(now_s):

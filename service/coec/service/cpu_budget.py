@@ -20,7 +20,8 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from coec.config import BudgetConfig, MonitorConfig, WindowConfig
@@ -388,71 +389,70 @@ class BudgetReport:
 
 
 class Budget:
-    """The budget of all pairs of a daemon; for any thread."""
+    """The budget of all pairs of a daemon; for any thread.
+
+    Attributes:
+        stretch: factor by which slices are to be longer than configured, at least 1.
+    """
 
     def __init__(self, config: BudgetConfig, clock: Callable[[], float] = time.monotonic) -> None:
         """`clock`: a steady clock, s."""
         self._clock = clock
         self._lock = threading.Lock()
         self._scheduler = CheckScheduler(config.cores)
+        self.stretch = 1.0
         self._usage = CpuUsage(clock())
         self._checked_s: dict[str, float] = {}
 
     def reconfigure(self, config: BudgetConfig) -> None:
         """Spends by these settings from now on."""
-        with self._lock:
-            self._scheduler.reconfigure(config.cores)
+        with self._scheduling() as scheduler:
+            scheduler.reconfigure(config.cores)
 
     def join(self, pair: str, monitor: MonitorConfig, window: WindowConfig) -> float:
         """A pair joins. Returns how long its first slice is to be, s, so that windows of different pairs end at
         different times. It is no shorter than an urgent slice, which suffices for a window."""
-        with self._lock:
-            phase = self._scheduler.join(pair, monitor.period_s, window.slice_s)
+        with self._scheduling() as scheduler:
+            phase = scheduler.join(pair, monitor.period_s, window.slice_s)
         return window.slice_s - phase * max(window.slice_s - monitor.urgent_slice_s, 0.0)
 
     def join_checks(self, name: str, period_s: float) -> None:
         """Something joins that wants a look in each period but no windows."""
-        with self._lock:
-            self._scheduler.join_checks(name, period_s)
+        with self._scheduling() as scheduler:
+            scheduler.join_checks(name, period_s)
 
     def try_acquire(self, pair: str, stamp_ns: int, *, suspected: bool) -> bool:
         """Whether a check of a pair may begin now that its stream has come to this stamp. If so, call `ended` after
         it."""
-        with self._lock:
-            return self._scheduler.try_acquire(pair, stamp_ns, suspected=suspected)
+        with self._scheduling() as scheduler:
+            return scheduler.try_acquire(pair, stamp_ns, suspected=suspected)
 
     def window_turn_s(self, pair: str, stamp_ns: int) -> float:
         """By how much the end of a window that the rig wants of a pair may be delayed, s, now that the pair's stream
         has come to this stamp. The windows before it are paid by then. It then counts as being on its way."""
-        with self._lock:
-            return self._scheduler.window_turn_s(pair, stamp_ns)
+        with self._scheduling() as scheduler:
+            return scheduler.window_turn_s(pair, stamp_ns)
 
     def release(self, pair: str) -> None:
         """A check that had begun has ended, with or without a result."""
-        with self._lock:
-            self._scheduler.release(pair)
+        with self._scheduling() as scheduler:
+            scheduler.release(pair)
 
     def pay(self, cost: Cost) -> None:
         """Books the cost of the worker's work, for a pair that has joined or for none. Windows of earlier runs,
         pictures and commissionings are not for the stream: they appear in the report, but no check waits until they
         are earned."""
         now_s = self._clock()
-        with self._lock:
+        with self._scheduling() as scheduler:
             self._usage.add(cost.kind, cost.pair, cost.cpu_s, now_s)
             match cost.kind:
                 case worker_jobs.Kind.CHECK | worker_jobs.Kind.REGISTER:
                     self._checked_s[cost.pair] = now_s
-                    self._scheduler.record_check(cost.pair, cost.cpu_s)
+                    scheduler.record_check(cost.pair, cost.cpu_s)
                 case worker_jobs.Kind.SOLVE:
-                    self._scheduler.record_solve(cost.pair, cost.cpu_s)
+                    scheduler.record_solve(cost.pair, cost.cpu_s)
                 case worker_jobs.PREFETCH:
-                    self._scheduler.record_preparation(cost.pair, cost.cpu_s)
-
-    @property
-    def stretch(self) -> float:
-        """Factor by which slices are to be longer than configured, at least 1."""
-        with self._lock:
-            return self._scheduler.stretch
+                    scheduler.record_preparation(cost.pair, cost.cpu_s)
 
     def report(self) -> BudgetReport:
         """How the budget is spent."""
@@ -469,3 +469,10 @@ class Budget:
                 {pair: now_s - checked_s for pair, checked_s in self._checked_s.items()},
                 self._usage.totals_s,
             )
+
+    @contextmanager
+    def _scheduling(self) -> Iterator[CheckScheduler]:
+        """The scheduler, for one thread at a time; what it does may change the stretch."""
+        with self._lock:
+            yield self._scheduler
+            self.stretch = self._scheduler.stretch

@@ -109,7 +109,6 @@ def test_predicates_change_nothing(tmp_path: Path) -> None:
                 for ahead_s in (-100, 0, 3, 100):
                     engine.selector.ends_slice((begin_s + ahead_s) * NS_PER_S)
                     engine.selector.is_step_back((begin_s + ahead_s) * NS_PER_S)
-                    engine.needs_tick(1e9)
                     engine.snapshot()
     assert curious.decisions() == calm.decisions()
     assert curious.worker.checked == calm.worker.checked

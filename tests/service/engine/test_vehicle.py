@@ -7,6 +7,7 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from math import inf
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -66,14 +67,12 @@ class Observations:
     keeps: bool = True
     unanswered: int = 0
     warms_up: bool = False
+    is_unpublished: bool = False
+    ticked_s: float = inf
 
     @property
     def selector(self) -> Observations:
         return self
-
-    def needs_tick(self, monotonic_s: float) -> bool:
-        del monotonic_s
-        return False
 
     def step(self, event: Event) -> list[Action]:
         if isinstance(event, Evaluate):

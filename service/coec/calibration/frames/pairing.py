@@ -81,7 +81,7 @@ class Pairer:
         self._cameras: deque[CameraFrame] = deque()
         self._sweeps: deque[LidarFrame] = deque()
         self._motions: deque[EgoMotion] = deque(maxlen=MOTION_SAMPLES)
-        self._waiting: deque[FramePair] = deque()
+        self._waiting: deque[tuple[CameraFrame, LidarFrame]] = deque()
         self._unmoved_ns: int | None = None
         self.losses: Counter[str] = Counter()
 
@@ -144,20 +144,20 @@ class Pairer:
                 # A camera that is faster than the LiDAR has frames between two sweeps; each is counted as a loss.
                 if self._cameras.popleft() is not camera:
                     self.losses["camera_surplus"] += 1
-            self._waiting.append(FramePair(camera, sweep))
+            self._waiting.append((camera, sweep))
 
     def _release(self, *, final: bool) -> list[FramePair]:
         """Hands out the pairs whose ego-motion is known, or will not become known."""
         released = []
         while self._waiting:
-            pair = self._waiting[0]
-            if self._expects_motion and not final and not self._motion_has_come(pair.stamp_ns):
-                if not self._motion_is_overdue(pair.stamp_ns):
+            camera, sweep = self._waiting[0]
+            if self._expects_motion and not final and not self._motion_has_come(camera.stamp_ns):
+                if not self._motion_is_overdue(camera.stamp_ns):
                     break
-                self._unmoved_ns = pair.stamp_ns
+                self._unmoved_ns = camera.stamp_ns
             self._waiting.popleft()
-            motion = motion_at(list(self._motions), pair.stamp_ns, self._motion_tolerance_ns)
-            released.append(FramePair(pair.camera, pair.lidar, motion))
+            motion = motion_at(list(self._motions), camera.stamp_ns, self._motion_tolerance_ns)
+            released.append(FramePair(camera, sweep, motion))
         return released
 
     def _motion_has_come(self, stamp_ns: int) -> bool:

@@ -84,10 +84,9 @@ class BetweenPairs:
         if self._open is not None:
             self._open.next_ns = stamp_ns + self._open.spacing_ns
 
-    def offer(self, pair: FramePair, stamp_ns: int, T_camera_lidar: Matrix4) -> FramePair | None:
-        """The pair of this stamp, thinned, if it is to be recorded; `T_camera_lidar` (4, 4) is the current
-        extrinsic."""
-        current = self._open
+    def offer(self, pair: FramePair, T_camera_lidar: Matrix4) -> FramePair | None:
+        """The pair, thinned, if it is to be recorded; `T_camera_lidar` (4, 4) is the current extrinsic."""
+        current, stamp_ns = self._open, pair.camera.stamp_ns
         if current is None or current.next_ns is None or stamp_ns < max(current.next_ns, current.afforded_ns):
             return None
         current.next_ns = stamp_ns + current.spacing_ns
@@ -336,7 +335,7 @@ class WindowCutter:
             events.append(PairSelected(self._open.window_id, pair, first=len(self._open.filled) == 1))
             if self._carried_over is not None and self.selected >= self._config.pairs:
                 events += self.finish()
-        elif (between := self._between.offer(pair, stamp_ns, T_camera_lidar)) is not None:
+        elif (between := self._between.offer(pair, T_camera_lidar)) is not None:
             events.append(PairBetween(self._open.window_id, between))
         return events
 

@@ -134,6 +134,7 @@ class FrameSelector:
         """Evaluates the next frame pair and uses it for the window, for a check, or not at all."""
         stamp_ns = pair.camera.stamp_ns
         actions: list[messages.Action] = []
+        self._follow_budget()
         if self.is_step_back(stamp_ns):
             self._schedule.bring_forward(stamp_ns)
             actions += self._apply_due(stamp_ns)
@@ -143,8 +144,9 @@ class FrameSelector:
                 actions += self.end_slice()
             actions += self._apply_due(stamp_ns)
         self._last_ns = stamp_ns
-        self._follow_budget()
-        self._follow_rig(stamp_ns)
+        since_ns = self._member.pop_window_request(stamp_ns)
+        if since_ns is not None:
+            self._hurry_for_rig(since_ns, stamp_ns)
         frozen_before = self._cutter.rejections["frozen"]
         self._urgency.observe(stamp_ns)
         urgent = self._urgency.apply(self._cutter)
@@ -220,11 +222,10 @@ class FrameSelector:
             slice_s = min(stretch * self._window.slice_s, MAX_SLICE_S)
             self._cutter.reconfigure(self._window.model_copy(update={"slice_s": slice_s}))
 
-    def _follow_rig(self, stamp_ns: int) -> None:
-        """If the rig has named a sensor of this pair as moved, hurries a window: the correction waits for a window of
-        each pair of that sensor. A window that began after the move may be on its way already."""
-        since_ns = self._member.pop_window_request(stamp_ns)
-        if since_ns is not None and since_ns > self._latest_window_ns and not self._urgency.is_waiting:
+    def _hurry_for_rig(self, since_ns: int, stamp_ns: int) -> None:
+        """The rig has named a sensor of this pair as moved, at `since_ns`: hurries a window, because the correction
+        waits for a window of each pair of that sensor. One that began after the move may be on its way already."""
+        if since_ns > self._latest_window_ns and not self._urgency.is_waiting:
             self._urgency.request(since_ns, self._budget.window_turn_s(self._pair.name, stamp_ns))
 
     def _on_window_event(self, event: window.WindowEvent, stamp_ns: int) -> list[messages.Action]:

@@ -12,6 +12,7 @@ applied at the sensor time that was fixed when the job was submitted. Only this 
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from math import inf
 from types import MappingProxyType
 
 import numpy as np
@@ -77,6 +78,8 @@ class Pair:
         selector: its selection of frames.
         warms_up: the worker compiles kernels before it takes jobs. No result is awaited then, because that takes longer
             than frames can be held.
+        ticked_s: steady clock at the latest `Tick`, s; -∞ if something has changed since, so that the next one is due.
+        is_unpublished: what is known waits for the disk before it is published.
         is_waiting: frame pairs of the sensor time of the latest `SensorTime` may not be evaluated yet, because a result
             of the worker or of the rig that counts before them has not come.
     """
@@ -105,7 +108,8 @@ class Pair:
         self._losses = losses
         self._clock = clock
         self._statistics = StreamStatistics()
-        self._clocks_checked_s = self._counted_s = clock.monotonic_s()
+        self.ticked_s = -inf
+        self._counted_s = clock.monotonic_s()
         selector.tick(self._counted_s)
         self._progress = CheckProgress(pair.monitor.period_s, clock.monotonic_s(), self._statistics)
         self._latest_check: CheckReply | None = None
@@ -113,7 +117,6 @@ class Pair:
         self._check_attempts = Attempts("checks", "monitor_blind")
         self._window_attempts = Attempts("windows", "windows_in_vain")
         self._overdue: Reason | None = None
-        self._has_changed = True
         self.is_unpublished = False
         self._health = store.state.health
         self._actions: list[messages.Action] = []
@@ -129,12 +132,6 @@ class Pair:
     def oldest_request(self) -> messages.PairRequest | None:
         """The request whose result is to be concluded next; None if there is none."""
         return self._schedule.oldest
-
-    def needs_tick(self, monotonic_s: float) -> bool:
-        """Whether the step `Tick` is due: something has changed, what waits for the disk can be published, or
-        time has passed."""
-        can_publish = self.is_unpublished and self.store.may_be_published()
-        return self._has_changed or can_publish or monotonic_s - self._clocks_checked_s >= TICK_S
 
     def snapshot(self) -> messages.PairSnapshot:
         """What is known now."""
@@ -232,13 +229,13 @@ class Pair:
         self._member.time_stepped_back(stamp_ns)
         self._progress.time_stepped_back()
         self._latest_check = None
-        self._has_changed = True
+        self.ticked_s = -inf
         self.store.update(lambda state: lifecycle.time_stepped_back(state, stamp_ns), stamp_ns, completed=False)
 
     def _tick(self, event: messages.Tick) -> None:
         """Gives up requests that have waited too long, ages the state, and publishes it."""
         now_s = self._clock.monotonic_s()
-        self._clocks_checked_s, self._has_changed = now_s, False
+        self.ticked_s = now_s
         self._statistics, self._counted_s = event.statistics, now_s - event.uncounted_s
         self.selector.tick(self._counted_s)
         for request in self._schedule.expired(self._counted_s):
@@ -265,12 +262,12 @@ class Pair:
         self._actions.append(messages.UseCalibration(self._baseline.calibration))
         self.store.note_command("reload", "reloaded", event.history_text, "SIGHUP", accepted=True)
         self.store.save()
-        self._has_changed = True
+        self.ticked_s = -inf
 
     # --- outcomes ---------------------------------------------------------------------------------------------------
 
     def _on_job(self, event: messages.JobDone) -> None:
-        self._has_changed = True
+        self.ticked_s = -inf
         match event.subject:
             case messages.WindowSubject():
                 self._on_solved(event.subject, event.outcome)
@@ -292,7 +289,7 @@ class Pair:
 
     def _answer(self, request: messages.PairRequest, result: messages.PairResult) -> None:
         """A result has come: concludes all whose turn it is. A second result of a request is ignored."""
-        self._has_changed = True
+        self.ticked_s = -inf
         self._schedule.answer(request, result)
         while (answered := self._schedule.next_answered()) is not None:
             self._schedule.conclude(answered, self._conclude(answered))

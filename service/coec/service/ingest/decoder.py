@@ -388,6 +388,9 @@ class Decoder:
         self._received = self._accepted = 0
         lidar = stream if isinstance(stream, LidarConfig) else None
         self._T_cloud_lidar = np.array(IDENTITY if lidar is None else lidar.T_cloud_lidar, dtype=np.float64)
+        self._is_own_frame = lidar is None or (
+            lidar.T_cloud_lidar == IDENTITY and lidar.cloud_frame_id in (None, lidar.frame_id)
+        )
         self._origin = lidar_origin.OriginCheck()
         self._checked_period: int | None = None
         self._contradicted = self._ring_reported = False
@@ -426,7 +429,7 @@ class Decoder:
         self._received += 1
         while self._overruns:
             self._senders.counted(self._overruns.popleft())
-        attachment = self._attachment_of(sample)
+        attachment = None if sample.attachment is None else self._attachment_of(sample.attachment)
         try:
             if len(sample.payload) > self._limits.max_message_bytes:
                 raise DecodeError("message_too_large", "larger than limits.max_message_bytes")
@@ -456,14 +459,14 @@ class Decoder:
             self.timed_by = frame.timed_by
         return frame
 
-    def _attachment_of(self, sample: InputSample) -> MessageAttachment | None:
+    def _attachment_of(self, packed: bytes) -> MessageAttachment | None:
         """The attachment of the sender; its number is counted. A message with an unreadable attachment is still
         taken."""
-        attachment = MessageAttachment.parse(sample.attachment)
-        if attachment is not None:
-            self._number(attachment.gid, attachment.sequence)
-        elif sample.attachment is not None:
+        attachment = MessageAttachment.parse(packed)
+        if attachment is None:
             self._losses.add(self._kind, "attachment_malformed")
+        else:
+            self._number(attachment.gid, attachment.sequence)
         return attachment
 
     def _number(self, sender: bytes, number: int) -> None:
@@ -512,7 +515,9 @@ class Decoder:
         frame."""
         if cloud.frame_id != (lidar.cloud_frame_id or lidar.frame_id):
             raise DecodeError("frame_id", "differs from the frame id in the configuration")
-        sweep = lidar_origin.from_origin(cloud, self._T_cloud_lidar, lidar.frame_id)
+        sweep = cloud
+        if not self._is_own_frame:
+            sweep = lidar_origin.from_origin(cloud, self._T_cloud_lidar, lidar.frame_id)
         contradiction = self._contradiction(sweep)
         if contradiction is not None:
             raise DecodeError(contradiction.cause, f"{contradiction.sentence} See lidar.{contradiction.setting}.")
