@@ -118,6 +118,7 @@ def _document(solution: Solution, elapsed_s: dict[str, float]) -> dict[str, Any]
     import numpy as np
 
     from coec.io.serialise import mistake_of
+    from coec.reports.page_parts import finite_or_none
     from coec.schemas.replies import CalibrationReport, Reason, WeighedPoses
 
     fit, offset = solution.fit, solution.offset
@@ -138,20 +139,13 @@ def _document(solution: Solution, elapsed_s: dict[str, float]) -> dict[str, Any]
         }
     if offset is not None:
         document["time_offset"] = {
-            "offset_s": _finite(offset.offset_s),
-            "sigma_s": _finite(offset.sigma_s),
-            "turn_spread_deg_per_s": _finite(np.degrees(offset.turn_spread_radps)),
+            "offset_s": finite_or_none(offset.offset_s),
+            "sigma_s": finite_or_none(offset.sigma_s),
+            "turn_spread_deg_per_s": finite_or_none(np.degrees(offset.turn_spread_radps)),
             "observable": offset.observable,
             "reason": offset.reason,
         }
     return document
-
-
-def _finite(value: float) -> float | None:
-    """The value, or None if it is not finite, because JSON has no NaN."""
-    import numpy as np
-
-    return float(value) if np.isfinite(value) else None
 
 
 def _write(

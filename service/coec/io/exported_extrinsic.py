@@ -247,24 +247,9 @@ def extrinsic_of_result(
     """A window's result, with its whole covariance; the reasons of a negative verdict become the objections. `camera`
     None: the intrinsics that the result holds."""
     reasons = tuple(reason.text for reason in result.verdict.reasons)
-    origin = ExtrinsicOrigin(
-        vehicle=result.vehicle,
-        pair=result.pair,
-        version=coec.__version__,
-        provenance="estimated",
-        window_id=result.window_id,
-        data_stamp_ns=result.data_stamp_ns,
-        config_hash=result.config_hash,
-        rejection_reasons=() if result.verdict.decision == "accepted" else reasons or ("Its verdict is negative.",),
-    )
-    return between_frames(
-        matrix_of(result.camera_from_lidar),
-        estimate_of(result).uncertainty.covariance,
-        (result.lidar_frame, result.camera_frame),
-        frames,
-        intrinsics_config_of(result.intrinsics) if camera is None else camera,
-        origin,
-    )
+    objections = () if result.verdict.decision == "accepted" else reasons or ("Its verdict is negative.",)
+    covariance = estimate_of(result).uncertainty.covariance
+    return _exported(result, "estimated", covariance, objections, camera, frames)
 
 
 def extrinsic_of_reply(
@@ -273,25 +258,31 @@ def extrinsic_of_reply(
     """The extrinsic that a service serves, with the part of its covariance that a reply holds: σ of each axis and two
     correlations. The only possible objection is that it is still the nominal calibration. `camera` None: the intrinsics
     that the reply holds."""
-    served = reply.provenance != "nominal"
+    objections = (NOMINAL,) if reply.provenance == "nominal" else ()
+    return _exported(reply, reply.provenance, _reply_covariance(reply), objections, camera, frames)
+
+
+def _exported(
+    value: CalibrationResult | ExtrinsicReply,
+    provenance: str,
+    covariance: NDArray[np.float64],
+    objections: tuple[str, ...],
+    camera: CameraIntrinsics | None,
+    frames: ExportFrames,
+) -> ExportedExtrinsic:
     origin = ExtrinsicOrigin(
-        vehicle=reply.vehicle,
-        pair=reply.pair,
+        vehicle=value.vehicle,
+        pair=value.pair,
         version=coec.__version__,
-        provenance=reply.provenance,
-        window_id=reply.window_id,
-        data_stamp_ns=reply.data_stamp_ns,
-        config_hash=reply.config_hash,
-        rejection_reasons=() if served else (NOMINAL,),
+        provenance=provenance,
+        window_id=value.window_id,
+        data_stamp_ns=value.data_stamp_ns,
+        config_hash=value.config_hash,
+        rejection_reasons=objections,
     )
-    return between_frames(
-        matrix_of(reply.camera_from_lidar),
-        _reply_covariance(reply),
-        (reply.lidar_frame, reply.camera_frame),
-        frames,
-        intrinsics_config_of(reply.intrinsics) if camera is None else camera,
-        origin,
-    )
+    own = (value.lidar_frame, value.camera_frame)
+    intrinsics = intrinsics_config_of(value.intrinsics) if camera is None else camera
+    return between_frames(matrix_of(value.camera_from_lidar), covariance, own, frames, intrinsics, origin)
 
 
 def intrinsics_config_of(intrinsics: Intrinsics | None) -> CameraIntrinsics | None:
