@@ -8,11 +8,12 @@ import pytest
 
 from coec.config import MonitorConfig
 from coec_lab.experiments import alarm_statistics
-from coec_lab.experiments.alarm_statistics import AlarmExperiments, Creep, Delay, FalseAlarmCount, FromStart
+from coec_lab.experiments.alarm_statistics import AlarmExperiments, Creep, Delay, FromStart
+from coec_lab.experiments.evaluation_schema import FalseAlarmsRow
 
 ALARMS = AlarmExperiments(
     MonitorConfig(),
-    (FalseAlarmCount(10.0, 5.0, 1),),
+    (FalseAlarmsRow(stated_h=10.0, driven_h=5.0, alarms=1),),
     (Delay(0.1, (inf, 5.0), (inf, inf)), Delay(1.0, (5.0, 10.0, 10.0), (10.0, 15.0, 20.0))),
     Creep(0.1, (2.0, 3.0, 4.0), (3.0, 4.0, inf)),
     (FromStart(0.5, (10.0, 10.0, 15.0, inf)),),

@@ -13,12 +13,11 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, FancyBboxPatch, Patch, Wedge
 
 from coec.calibration.types import Matrix4
-from coec_lab.experiments.plots import png
+from coec_lab.experiments.plots import png, titled
 
 SENSOR_COLOURS: Mapping[str, str] = MappingProxyType(
     {
@@ -94,8 +93,7 @@ def rig_from_above(sensors: Sequence[PlottedSensor], edges: Sequence[PlottedEdge
     places = {sensor.name: _place(sensor) for sensor in sensors}
     if unknown := sorted({name for edge in edges for name in (edge.a, edge.b)} - set(places)):
         raise ValueError(f"edges of sensors that the picture does not have: {', '.join(unknown)}")
-    figure = Figure(figsize=(8.4, 9.2), layout="constrained")
-    figure.suptitle(title)
+    figure = titled(title, 8.4, 9.2)
     axes = figure.subplots()
     _frame(axes, list(places.values()))
     colours = Normalize(0.0, CERTAIN_SIGMAS, clip=True)
@@ -254,8 +252,7 @@ def timeline(
         marks: (second, what happened).
         limit_deg: a good error stays below this.
     """
-    figure = Figure(figsize=(11.0, 4.6), layout="constrained")
-    figure.suptitle(title)
+    figure = titled(title, 11.0, 4.6)
     axes = figure.subplots()
     for (begin, _, state), (end, *_) in pairwise(series):
         axes.axvspan(begin, end, color=HEALTH_COLOURS.get(state, "white"), alpha=0.3, linewidth=0)

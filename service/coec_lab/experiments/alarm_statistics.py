@@ -61,16 +61,6 @@ OnProgress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
-class FalseAlarmCount:
-    """How often the evidence of a right mount reached the alarm level that belongs to a stated time between false
-    alarms (h), in so many hours of driving."""
-
-    stated_h: float
-    driven_h: float
-    alarms: int
-
-
-@dataclass(frozen=True, slots=True)
 class Delay:
     """Time from a step to the first check that suspects it and to the one that confirms it, per drawn step, s; infinite
     where this did not happen within `PATIENCE_CHECKS`."""
@@ -105,7 +95,7 @@ class AlarmExperiments:
     """All experiments at one configuration."""
 
     config: MonitorConfig
-    false: tuple[FalseAlarmCount, ...]
+    false: tuple[wire.FalseAlarmsRow, ...]
     delays: tuple[Delay, ...]
     creep: Creep
     from_start: tuple[FromStart, ...]
@@ -128,7 +118,7 @@ def measured(config: MonitorConfig, hours: float, steps: int, on_progress: OnPro
     return AlarmExperiments(config, false, tuple(delays), crept, tuple(started))
 
 
-def false_alarms(config: MonitorConfig, hours: float) -> tuple[FalseAlarmCount, ...]:
+def false_alarms(config: MonitorConfig, hours: float) -> tuple[wire.FalseAlarmsRow, ...]:
     """Counts how often the evidence of a right mount rises to the level of each stated time. A rise counts once; the
     next can count only after the suspicion is over."""
     levels = change_detector.alarm_levels(config)
@@ -141,7 +131,10 @@ def false_alarms(config: MonitorConfig, hours: float) -> tuple[FalseAlarmCount, 
                 above[place], alarms[place] = True, alarms[place] + 1
             elif state.evidence < levels.clear:
                 above[place] = False
-    return tuple(FalseAlarmCount(stated, hours, count) for stated, count in zip(STATED_H, alarms, strict=True))
+    return tuple(
+        wire.FalseAlarmsRow(stated_h=stated_h, driven_h=hours, alarms=count)
+        for stated_h, count in zip(STATED_H, alarms, strict=True)
+    )
 
 
 def delay(config: MonitorConfig, step_deg: float, steps: int) -> Delay:
@@ -269,9 +262,7 @@ def document_of(alarms: AlarmExperiments) -> wire.AlarmsReport:
         period_s=config.period_s,
         hours_between_false_alarms=config.hours_between_false_alarms,
         hours_between_false_suspicions=config.hours_between_false_suspicions,
-        false=tuple(
-            wire.FalseAlarmsRow(stated_h=row.stated_h, driven_h=row.driven_h, alarms=row.alarms) for row in alarms.false
-        ),
+        false=alarms.false,
         delays=tuple(
             wire.DelayRow(
                 step_deg=row.step_deg,

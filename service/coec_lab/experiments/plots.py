@@ -20,6 +20,7 @@ from matplotlib.projections.polar import PolarAxes
 from numpy.typing import NDArray
 
 from coec.calibration.baseline import PaperLimits
+from coec.reports.console import AXIS_NAMES
 from coec_lab.experiments import evaluation_charts, solve_statistics
 from coec_lab.experiments.depth_quality import DepthQuality, Pairing
 from coec_lab.experiments.matrix_statistics import normalised_errors
@@ -46,8 +47,7 @@ def bullseye(
 
     `bullseye.start_places` says how the sphere of directions is flattened.
     """
-    figure = Figure(figsize=(6.2 * (len(directions) + 1), 7.0), layout="constrained")
-    figure.suptitle(title)
+    figure = titled(title, 6.2 * (len(directions) + 1), 7.0)
     colours = LogNorm(*ERROR_RANGE_DEG, clip=True)
     for column, (name, unit) in enumerate(directions.items()):
         _plot_starts(_polar(figure, 1, len(directions) + 1, column), name, unit, outcomes, colours)
@@ -63,8 +63,7 @@ def compared(
 ) -> bytes:
     """A column per method: above, the start directions ((n, 3) unit vectors in camera axes) coloured by where their
     solves ended; below, where they ended. The targets have one radius, that of the worst method."""
-    figure = Figure(figsize=(5.6 * len(methods) + 1.0, 11.5), layout="constrained")
-    figure.suptitle(title)
+    figure = titled(title, 5.6 * len(methods) + 1.0, 11.5)
     colours = LogNorm(*ERROR_RANGE_DEG, clip=True)
     rim_deg = max(evaluation_charts.rim_of(outcomes) for outcomes in methods.values())
     panels = []
@@ -169,15 +168,24 @@ def _polar(figure: Figure, rows: int, columns: int, index: int) -> PolarAxes:
     return axes
 
 
+def titled(title: str, width: float, height: float) -> Figure:
+    """An empty figure, inches."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    figure.suptitle(title)
+    return figure
+
+
+def _grid_and_legend(axes: Axes) -> None:
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small")
+
+
 def png(figure: Figure) -> bytes:
     """The figure as a file; equal figures give equal bytes."""
     stream = io.BytesIO()
     # Without the software's name and version, which would differ.
     figure.savefig(stream, format="png", dpi=DPI, metadata={"Software": None})
     return stream.getvalue()
-
-
-AXIS_TITLES = ("rx pitch", "ry yaw", "rz roll", "tx right", "ty down", "tz forward")
 
 
 def landscape(curves: Mapping[str, Views], title: str) -> bytes:
@@ -189,8 +197,7 @@ def landscape(curves: Mapping[str, Views], title: str) -> bytes:
     """
     axes_scanned = len(next(iter(curves.values())).wide)
     groups = [range(3), range(3, 6)] if axes_scanned == 6 else [range(3)]
-    figure = Figure(figsize=(15.0, 3.9 * 2 * len(groups)), layout="constrained")
-    figure.suptitle(title)
+    figure = titled(title, 15.0, 3.9 * 2 * len(groups))
     panels = figure.subplots(2 * len(groups), 3, sharey="row", squeeze=False)
     for row, group in enumerate(groups):
         for name, views in curves.items():
@@ -234,7 +241,7 @@ def _plot_scan(axes: Axes, name: str, scan: Scan, lowest: float, height: float) 
     best = scan.best_offset * scale
     (line,) = axes.plot(scan.offsets * scale, scores, linewidth=1.3, label=f"{name}, best at {best:+.2f} {unit}")
     axes.plot(best, scores.max(), "o", color=line.get_color(), markersize=4)
-    axes.set_xlabel(f"{AXIS_TITLES[scan.axis]}, {unit}")
+    axes.set_xlabel(f"{AXIS_NAMES[scan.axis]}, {unit}")
 
 
 def _errors(
@@ -246,8 +253,7 @@ def _errors(
     title: str,
 ) -> bytes:
     columns = 2 if with_translation else 1
-    figure = Figure(figsize=(8.0 * columns, 6.5), layout="constrained")
-    figure.suptitle(title)
+    figure = titled(title, 8.0 * columns, 6.5)
     panels = figure.subplots(2, columns, sharex=True, squeeze=False, height_ratios=(3, 1))
     _plot_errors(
         panels[0, 0],
@@ -305,8 +311,7 @@ def normalised(by_reference: Mapping[str, solve_statistics.NormalisedErrors], ti
 
     Above the diagonal claims are wider than errors; below it they are too narrow.
     """
-    figure = Figure(figsize=(14.0, 5.0 * len(by_reference)), layout="constrained")
-    figure.suptitle(title)
+    figure = titled(title, 14.0, 5.0 * len(by_reference))
     panels = figure.subplots(len(by_reference), 2, squeeze=False)
     for (left, right), (against, errors) in zip(panels, by_reference.items(), strict=True):
         _plot_histogram(left, errors)
@@ -322,13 +327,12 @@ def _plot_histogram(axes: Axes, errors: solve_statistics.NormalisedErrors) -> No
     normal = NormalDist()
     expected = np.diff([0.0, *(normal.cdf(edge) for edge in edges[1:-1]), 1.0])
     axes.stairs(expected, edges, fill=True, color="lightgrey", label="normal distribution")
-    for name, counts in zip(AXIS_TITLES, errors.histogram, strict=True):
+    for name, counts in zip(AXIS_NAMES, errors.histogram, strict=True):
         if counts.sum():
             axes.stairs(counts / counts.sum(), edges, linewidth=1.4, label=name)
     axes.set_xlabel("error / claimed σ; the outermost bins hold what lies beyond")
     axes.set_ylabel("share of results")
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize="small")
+    _grid_and_legend(axes)
 
 
 def _plot_reliability(axes: Axes, errors: solve_statistics.NormalisedErrors) -> None:
@@ -337,7 +341,7 @@ def _plot_reliability(axes: Axes, errors: solve_statistics.NormalisedErrors) -> 
     held = np.concatenate([errors.reliability, errors.coverage])
     order = np.argsort(shares)
     axes.plot([0.0, 1.0], [0.0, 1.0], color="grey", linewidth=0.8, linestyle="--", label="true claims")
-    for name, column in zip(AXIS_TITLES, held.T, strict=True):
+    for name, column in zip(AXIS_NAMES, held.T, strict=True):
         if np.isfinite(column).any():
             axes.plot(shares[order], column[order], "o-", markersize=4, linewidth=1.2, label=name)
     for limit, share in zip(solve_statistics.SIGMAS, beyond, strict=True):
@@ -347,8 +351,7 @@ def _plot_reliability(axes: Axes, errors: solve_statistics.NormalisedErrors) -> 
     axes.set_ylabel("share that does")
     axes.set_xlim(0.0, 1.02)
     axes.set_ylim(0.0, 1.02)
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize="small")
+    _grid_and_legend(axes)
 
 
 ERROR_REACH = 6.0
@@ -361,8 +364,9 @@ def matrix_errors(report: MatrixReport) -> bytes:
     """A row of panels per number of degrees of freedom, from its accepted windows: for each axis a histogram of errors
     over sigmas beside the normal distribution that they should follow; last, the share of errors by sigmas."""
     shown = [solves for solves in report.solves if solves.accepted] or list(report.solves)
-    figure = Figure(figsize=(3.3 * 7, 3.4 * max(len(shown), 1)), layout="constrained")
-    figure.suptitle("error over claimed sigma, accepted windows; grey: as it should be")
+    figure = titled(
+        "error over claimed sigma, accepted windows; grey: as it should be", 3.3 * 7, 3.4 * max(len(shown), 1)
+    )
     panels = figure.subplots(max(len(shown), 1), 7, squeeze=False)
     for row, solves in zip(panels, shown, strict=False):
         _plot_solves(row, report, solves)
@@ -373,7 +377,7 @@ def _plot_solves(
     row: np.ndarray[tuple[int], np.dtype[np.object_]], report: MatrixReport, solves: SolveStatistics
 ) -> None:
     coverage: Axes = row[6]
-    should = np.array([_within_normal(sigmas) for sigmas in SIGMA_GRID])
+    should = np.array([erf(sigmas / sqrt(2.0)) for sigmas in SIGMA_GRID])
     coverage.plot(SIGMA_GRID, 100.0 * should, color="grey", linewidth=2.5)
     for axis in range(6):
         panel: Axes = row[axis]
@@ -387,18 +391,14 @@ def _plot_solves(
         middle = np.linspace(-ERROR_REACH, ERROR_REACH, 200)
         normal = np.exp(-(middle**2) / 2) / np.sqrt(2 * np.pi)
         panel.plot(middle, len(errors) * (edges[1] - edges[0]) * normal, color="grey", linewidth=2.5)
-        panel.set_title(f"{solves.dof} dof, {AXIS_TITLES[axis]}, n = {len(errors)}", fontsize="medium")
+        panel.set_title(f"{solves.dof} dof, {AXIS_NAMES[axis]}, n = {len(errors)}", fontsize="medium")
         if len(errors):
             share = (np.abs(errors)[:, None] <= SIGMA_GRID).mean(axis=0)
-            coverage.plot(SIGMA_GRID, 100.0 * share, linewidth=1.2, label=AXIS_TITLES[axis])
+            coverage.plot(SIGMA_GRID, 100.0 * share, linewidth=1.2, label=AXIS_NAMES[axis])
     coverage.set_title("share within so many sigmas, %", fontsize="medium")
     coverage.grid(alpha=0.3)
     if coverage.get_legend_handles_labels()[0]:
         coverage.legend(fontsize="small")
-
-
-def _within_normal(sigmas: float) -> float:
-    return erf(sigmas / sqrt(2.0))
 
 
 RESIDUAL_LIMIT = 0.5
@@ -420,8 +420,7 @@ def joint(counts: NDArray[np.int64], title: str) -> bytes:
 
 def curves(quality: DepthQuality, title: str) -> bytes:
     """Mutual information along the three axes about the calibration, the level of unrelated maps, and the optimum."""
-    figure = Figure(figsize=(15.0, 4.6), layout="constrained")
-    figure.suptitle(title)
+    figure = titled(title, 15.0, 4.6)
     panels = figure.subplots(1, 3, sharey=True)
     for axes, scan in zip(panels, quality.scans, strict=True):
         bias_deg, half_deg = degrees(quality.bias[scan.axis]), degrees(quality.half_width[scan.axis])
@@ -431,9 +430,8 @@ def curves(quality: DepthQuality, title: str) -> bytes:
         axes.axvline(
             bias_deg, color="tab:green", linewidth=0.9, label=f"optimum of all three axes, {bias_deg:+.2f} deg"
         )
-        axes.set_xlabel(f"{AXIS_TITLES[scan.axis]}, deg")
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize="small")
+        axes.set_xlabel(f"{AXIS_NAMES[scan.axis]}, deg")
+        _grid_and_legend(axes)
     panels[0].set_ylabel("mutual information, nats")
     return png(figure)
 
@@ -448,8 +446,7 @@ def frame(image_bgr: NDArray[np.uint8], values: NDArray[np.float32], pairing: Pa
     rows, columns = (2, 1) if wide else (1, 2)
     panel_width = 13.0 if wide else 8.0
     panel_height = panel_width * height / width + 0.5
-    figure = Figure(figsize=(panel_width * columns + 1.2, panel_height * rows + 0.6), layout="constrained")
-    figure.suptitle(title)
+    figure = titled(title, panel_width * columns + 1.2, panel_height * rows + 0.6)
     panels: Sequence[object] = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
     seen, output = panels
     extent = (-0.5, width - 0.5, height - 0.5, -0.5)
@@ -481,8 +478,7 @@ ROTATIONS = ((2, "roll"), (0, "pitch"), (1, "yaw"))
 
 def failure_metrics(figures: Sequence[FailureFigures], limits: PaperLimits, title: str) -> bytes:
     """The three figures at the right pose and at wrong ones, with the limits between them."""
-    figure = Figure(figsize=(14.0, 4.6), layout="constrained")
-    figure.suptitle(title)
+    figure = titled(title, 14.0, 4.6)
     for axes, (name, label) in zip(figure.subplots(1, 3), PANELS, strict=True):
         values = {moved: [getattr(f, name) for f in figures if f.moved_deg == moved] for moved in MOVES_DEG}
         edges = np.histogram_bin_edges(np.concatenate(list(values.values())), FAILURE_BINS)
@@ -492,15 +488,13 @@ def failure_metrics(figures: Sequence[FailureFigures], limits: PaperLimits, titl
         limit = {"mi": limits.min_mi, "f1": limits.max_f1, "f2": limits.min_f2}[name]
         axes.axvline(limit, color="black", linestyle="--", label=f"limit {limit:.3g}")
         axes.set_xlabel(label)
-        axes.legend(fontsize="small")
-        axes.grid(alpha=0.3)
+        _grid_and_legend(axes)
     return png(figure)
 
 
 def drive(runs: Mapping[str, Sequence[tuple[float, solve_statistics.SolveOutcome]]], title: str) -> bytes:
     """Errors of roll, pitch and yaw over sensor time (seconds), for several named sets of starts."""
-    figure = Figure(figsize=(11.0, 8.0), layout="constrained")
-    figure.suptitle(title)
+    figure = titled(title, 11.0, 8.0)
     panels = figure.subplots(3, 1, sharex=True)
     for axes, (axis, name) in zip(panels, ROTATIONS, strict=True):
         for label, outcomes in runs.items():
