@@ -247,9 +247,9 @@ def extrinsic_of_result(
     """A window's result, with its whole covariance; the reasons of a negative verdict become the objections. `camera`
     None: the intrinsics that the result holds."""
     reasons = tuple(reason.text for reason in result.verdict.reasons)
-    objections = () if result.verdict.decision == "accepted" else reasons or ("Its verdict is negative.",)
+    rejection_reasons = () if result.verdict.decision == "accepted" else reasons or ("Its verdict is negative.",)
     covariance = estimate_of(result).uncertainty.covariance
-    return _exported(result, "estimated", covariance, objections, camera, frames)
+    return _exported(result, "estimated", covariance, rejection_reasons, camera, frames)
 
 
 def extrinsic_of_reply(
@@ -258,15 +258,15 @@ def extrinsic_of_reply(
     """The extrinsic that a service serves, with the part of its covariance that a reply holds: σ of each axis and two
     correlations. The only possible objection is that it is still the nominal calibration. `camera` None: the intrinsics
     that the reply holds."""
-    objections = (NOMINAL,) if reply.provenance == "nominal" else ()
-    return _exported(reply, reply.provenance, _reply_covariance(reply), objections, camera, frames)
+    rejection_reasons = (NOMINAL,) if reply.provenance == "nominal" else ()
+    return _exported(reply, reply.provenance, _reply_covariance(reply), rejection_reasons, camera, frames)
 
 
 def _exported(
     value: CalibrationResult | ExtrinsicReply,
     provenance: str,
     covariance: NDArray[np.float64],
-    objections: tuple[str, ...],
+    rejection_reasons: tuple[str, ...],
     camera: CameraIntrinsics | None,
     frames: ExportFrames,
 ) -> ExportedExtrinsic:
@@ -278,7 +278,7 @@ def _exported(
         window_id=value.window_id,
         data_stamp_ns=value.data_stamp_ns,
         config_hash=value.config_hash,
-        rejection_reasons=objections,
+        rejection_reasons=rejection_reasons,
     )
     own = (value.lidar_frame, value.camera_frame)
     intrinsics = intrinsics_config_of(value.intrinsics) if camera is None else camera

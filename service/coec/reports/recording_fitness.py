@@ -4,7 +4,7 @@ The stamps of all frames are known without loading them; only a few frames, even
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
 from types import MappingProxyType
@@ -253,24 +253,39 @@ def passes(sweep: types.LidarFrame) -> int:
 _ORDER: dict[Level, int] = {"fail": 0, "warn": 1, "ok": 2}
 
 
-def _remarks(seen: Fitness) -> list[Notice | None]:
-    return [
-        _too_short(seen),
-        _unpaired(seen),
-        _view(seen),
-        _finite(seen),
-        _motion(seen),
-        _standing(seen),
-        _rings(seen),
-        _joined(seen),
-        _gaps(seen),
-    ]
-
-
-def _too_short(seen: Fitness) -> Notice | None:
-    if seen.camera.frames >= MIN_PAIRS:
-        return None
-    return Notice("fail", "too_few_frames", f"{seen.camera.frames} camera frames; a calibration needs {MIN_PAIRS}.")
+def _remarks(seen: Fitness) -> Iterator[Notice | None]:
+    if seen.camera.frames < MIN_PAIRS:
+        yield Notice("fail", "too_few_frames", f"{seen.camera.frames} camera frames; a calibration needs {MIN_PAIRS}.")
+    yield _unpaired(seen)
+    if seen.in_view < LITTLE_IN_VIEW:
+        text = (
+            f"{seen.in_view:.1%} of the points lie in the image at the nominal extrinsic: is it from LiDAR to camera?"
+        )
+        yield Notice("fail" if seen.in_view == 0.0 else "warn", "little_in_view", text)
+    if seen.not_finite >= SOME_NOT_FINITE:
+        text = (
+            f"{seen.not_finite:.0%} of the points have no finite position or time and are left out. This is so in "
+            "organised clouds, where a beam without an echo gives NaN; if yours is none, see to its driver or filter."
+        )
+        yield Notice("ok", "not_finite", text)
+    yield _motion(seen)
+    if seen.standing is not None and seen.standing >= 0.5:
+        text = f"The vehicle stood in {seen.standing:.0%} of the pairs: they count as few looks."
+        yield Notice("warn", "standing", text)
+    if seen.rings == 1:
+        text = "The field `ring` holds one number and is ignored: beams are distinguished by their elevation."
+        yield Notice("warn", "constant_ring", text)
+    if seen.rings <= 0 and seen.passes in FEW_PASSES:
+        text = (
+            f"The points' times begin anew {seen.passes} times in a sweep, and no ring tells beams apart: if the cloud "
+            "is of several LiDARs (concatenated), take the topic of one."
+        )
+        yield Notice("warn", "perhaps_concatenated", text)
+    for name, stream in (("camera", seen.camera), ("LiDAR", seen.lidar)):
+        if stream.rate_hz > 1.0 and stream.longest_gap_s * stream.rate_hz > MANY_GAPS:
+            text = f"The {name} is silent for {stream.longest_gap_s:.1f} s, at {stream.rate_hz:.1f} Hz otherwise."
+            yield Notice("ok", "gaps", text)
+            break
 
 
 def _unpaired(seen: Fitness) -> Notice | None:
@@ -282,13 +297,6 @@ def _unpaired(seen: Fitness) -> Notice | None:
     if seen.paired < 0.9:
         return Notice("warn", "few_pairs", f"{1 - seen.paired:.0%} of the camera frames have no sweep near them.")
     return None
-
-
-def _view(seen: Fitness) -> Notice | None:
-    if seen.in_view >= LITTLE_IN_VIEW:
-        return None
-    text = f"{seen.in_view:.1%} of the points lie in the image at the nominal extrinsic: is it from LiDAR to camera?"
-    return Notice("fail" if seen.in_view == 0.0 else "warn", "little_in_view", text)
 
 
 def image_notices(image: types.EncodedImage) -> list[Notice]:
@@ -339,17 +347,6 @@ def _not_finite(sweep: types.LidarFrame) -> float:
     return sweep.not_finite / (sweep.not_finite + len(sweep.xyz_m))
 
 
-def _finite(seen: Fitness) -> Notice | None:
-    if seen.not_finite < SOME_NOT_FINITE:
-        return None
-    return Notice(
-        "ok",
-        "not_finite",
-        f"{seen.not_finite:.0%} of the points have no finite position or time and are left out. This is so in "
-        "organised clouds, where a beam without an echo gives NaN; if yours is none, see to its driver or filter.",
-    )
-
-
 def _motion(seen: Fitness) -> Notice | None:
     if seen.motion is None:
         return Notice("warn", "no_ego_motion", "No ego-motion: sweeps taken while driving cannot be compensated.")
@@ -366,43 +363,6 @@ def _motion(seen: Fitness) -> Notice | None:
     if not seen.point_time and seen.speed_mps is not None and seen.speed_mps[1] > SMEARING_MPS:
         text = "Points have no time and the rig no sweep timing: sweeps taken while driving cannot be compensated."
         return Notice("warn", "no_point_time", text)
-    return None
-
-
-def _standing(seen: Fitness) -> Notice | None:
-    if seen.standing is None or seen.standing < 0.5:
-        return None
-    return Notice(
-        "warn", "standing", f"The vehicle stood in {seen.standing:.0%} of the pairs: they count as few looks."
-    )
-
-
-def _rings(seen: Fitness) -> Notice | None:
-    if seen.rings != 1:
-        return None
-    return Notice(
-        "warn",
-        "constant_ring",
-        "The field `ring` holds one number and is ignored: beams are distinguished by their elevation.",
-    )
-
-
-def _joined(seen: Fitness) -> Notice | None:
-    if seen.rings > 0 or seen.passes not in FEW_PASSES:
-        return None
-    return Notice(
-        "warn",
-        "perhaps_concatenated",
-        f"The points' times begin anew {seen.passes} times in a sweep, and no ring tells beams apart: if the cloud is "
-        "of several LiDARs (concatenated), take the topic of one.",
-    )
-
-
-def _gaps(seen: Fitness) -> Notice | None:
-    for name, stream in (("camera", seen.camera), ("LiDAR", seen.lidar)):
-        if stream.rate_hz > 1.0 and stream.longest_gap_s * stream.rate_hz > MANY_GAPS:
-            text = f"The {name} is silent for {stream.longest_gap_s:.1f} s, at {stream.rate_hz:.1f} Hz otherwise."
-            return Notice("ok", "gaps", text)
     return None
 
 
