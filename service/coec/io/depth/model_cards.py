@@ -11,9 +11,10 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from coec.config import describe, load_yaml
+from coec.config.model import ConfigModel
 from coec.errors import ConfigError, ModelError
 
 Channels = tuple[float, float, float]
@@ -23,11 +24,7 @@ Side = Annotated[int, Field(ge=16, le=4096)]
 CARDS = Path(__file__).parent / "cards"
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class FixedSize(_Part):
+class FixedSize(ConfigModel):
     """Every image is stretched to this size, px."""
 
     height: Side
@@ -38,7 +35,7 @@ class FixedSize(_Part):
         return self.height, self.width
 
 
-class KeepAspect(_Part):
+class KeepAspect(ConfigModel):
     """One side of the image becomes `side` px, the other follows; both are rounded to `multiple` px.
 
     `fit` names the side: `short`, `long`, or `minimal` for the one that needs the least scaling. These are
@@ -65,7 +62,7 @@ class KeepAspect(_Part):
         return max(self.multiple, round(length_px / self.multiple) * self.multiple)
 
 
-class CardInput(_Part):
+class CardInput(ConfigModel):
     """From an image to the input tensor, (1, 3, height, width) float32: (value · scale - mean) / std."""
 
     name: str | None = Field(default=None, description="name of the input tensor; the only one when not given")
@@ -85,7 +82,7 @@ class CardInput(_Part):
         return self
 
 
-class CardOutput(_Part):
+class CardOutput(ConfigModel):
     """What the output tensor means. Its values are used unchanged, so that this describes them and converts
     nothing."""
 
@@ -100,7 +97,7 @@ class CardOutput(_Part):
         return self
 
 
-class ModelCard(_Part):
+class ModelCard(ConfigModel):
     """A depth network. `file` is the usual file name; `sha256` is that of the one file on which this card was
     measured."""
 
@@ -118,7 +115,7 @@ class ModelCard(_Part):
     )
 
 
-class _Reference(_Part):
+class _Reference(ConfigModel):
     card: str
 
 

@@ -18,12 +18,13 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import ValidationError, model_validator
 
 from coec.calibration.frames import motion_evidence, sweep_evidence
 from coec.calibration.frames.pairing import motion_at
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Recognition, Rig
 from coec.config import CameraIntrinsics, FilePath, Matrix4x4, describe
+from coec.config.model import ConfigModel
 from coec.config.pair import with_direction
 from coec.errors import ConfigError, DecodeError, SourceError, UsageError
 from coec.geometry.projection import share_in_image
@@ -333,10 +334,8 @@ OUT_OF_VIEW: Final = 0.3
 """Ratio of the points in view in two frames from which on one of them is not the camera's."""
 
 
-class IntrinsicsFile(BaseModel):
+class IntrinsicsFile(ConfigModel):
     """`intrinsics=FILE`: the head of a `dataset.yaml`, for bags without camera info or without a transform."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     camera: CameraIntrinsics
     T_camera_lidar: Matrix4x4 | None = None

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 from ruamel.yaml.nodes import CollectionNode, MappingNode, Node
@@ -36,6 +36,7 @@ from coec.config import (
     describe,
     load_yaml,
 )
+from coec.config.model import ConfigModel
 from coec.config.pair import Pose, with_direction
 from coec.errors import ConfigError, DecodeError, OutputError, SourceError, UsageError
 from coec.geometry import cameras, se3
@@ -68,18 +69,14 @@ _DEPTH_CODES = 65_534
 """Span of the codes 1 ... 65535 that mean a value in a 16-bit PNG; 0 means "no value"."""
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class TwistDocument(_Strict):
+class TwistDocument(ConfigModel):
     """Velocity of the LiDAR in its own frame, m/s and rad/s."""
 
     linear_mps: tuple[float, float, float]
     angular_radps: tuple[float, float, float]
 
 
-class FrameDocument(_Strict):
+class FrameDocument(ConfigModel):
     """One image and its cloud; paths are relative to the manifest."""
 
     image: FilePath
@@ -90,7 +87,7 @@ class FrameDocument(_Strict):
     twist: TwistDocument | None = None
 
 
-class ManifestDocument(_Strict):
+class ManifestDocument(ConfigModel):
     """The whole of `dataset.yaml`."""
 
     pair: Name
