@@ -102,8 +102,6 @@ Objective = Annotated[str | None, _CALIBRATION["objective"]]
 Dof = Annotated[DegreesOfFreedom | None, _CALIBRATION["dof"]]
 CameraModel = Annotated[str | None, _CALIBRATION["camera_model"]]
 Frames = Annotated[int | None, _CALIBRATION["frames"]]
-NoMotionCompensation = Annotated[bool, _CALIBRATION["motion_compensation"]]
-Perturb = Annotated[str | None, _CALIBRATION["perturb"]]
 
 
 def with_calibration_options(options: type) -> Callable[[Callable[..., int]], Callable[..., int]]:

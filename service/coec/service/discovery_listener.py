@@ -108,7 +108,7 @@ class DiscoveryListener:
         self._pairs = {
             name: _PendingPair(
                 pair,
-                _readers(pair, config),
+                {stream: SampleReader(stream, one, config.limits) for stream, one in pair.streams.items()},
                 ReceivedMetadata(max_message_bytes=config.limits.max_message_bytes),
                 discovered=earlier.get(name),
                 built=name in earlier,
@@ -320,8 +320,3 @@ def _payload(sample: InputSample, expected: str) -> bytes:
     if encoding == CDR and type_name not in ("", expected):
         raise DecodeError("wrong_type", f"a message of another type: expected {expected}")
     return sample.payload
-
-
-def _readers(pair: OpenPairConfig, config: Config) -> dict[str, SampleReader]:
-    """Readers of the pair's streams, by stream."""
-    return {name: SampleReader(name, stream, config.limits) for name, stream in pair.streams.items()}

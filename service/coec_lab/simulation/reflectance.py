@@ -171,8 +171,8 @@ GHOST = 15.0
 """From this strength on the neighbours measure the range of the retro-reflector, too."""
 BLOOM = (0.08, 0.004)
 """Share of a saturated return that the next firing of the same beam receives, and the one after it."""
-WET_SHARE, WET_LOSS, PUDDLE_M = 0.45, 0.5, 4.0
-"""A wet road reflects this share of a dry one; share of the returns lost at grazing incidence; size of puddles."""
+WET_SHARE, WET_LOSS = 0.45, 0.5
+"""A wet road reflects this share of a dry one; share of the returns lost at grazing incidence."""
 
 
 def _of_materials(others: float, **values: float) -> Doubles:

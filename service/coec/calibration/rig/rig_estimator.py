@@ -362,8 +362,10 @@ def _corrected(rig: VehicleRig, event: MoveEvent, fresh: list[str], stamp_ns: in
     if len(measured) < 2 or not joint_poses:
         return rig
     if rig.before is not None:
+        # Pairs without a window from after the move: the windows of other pairs place the sensor that moved, and what
+        # was known before places its other sensor.
         joint_poses |= {
-            name: _joint_pose_from_others(joint, name)
+            name: JointPose(joint.T_a_b[name], joint.between(name, name))
             for name in _served(rig, [*rig.before.edges])
             if name not in fresh
         }
@@ -408,12 +410,6 @@ def _joint_pose(joint: JointEstimate, edge: str, own: Measurement) -> JointPose:
     difference = np.where(axes, se3.difference(joint.T_a_b[edge], own.T_camera_lidar), 0.0)
     covariance = np.where(axes[:, None] & axes, joint.between(edge, edge), np.nan)
     return JointPose(se3.perturb(own.T_camera_lidar, difference), covariance)
-
-
-def _joint_pose_from_others(joint: JointEstimate, edge: str) -> JointPose:
-    """The pose of a pair without a window from after the move. The windows of other pairs place the sensor that moved,
-    and what was known before places its other sensor."""
-    return JointPose(joint.T_a_b[edge], joint.between(edge, edge))
 
 
 def _over(rig: VehicleRig, pairs: tuple[str, ...], stamp_ns: int) -> VehicleRig:

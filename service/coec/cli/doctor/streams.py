@@ -23,7 +23,7 @@ from coec.io.depth.depth_maps import STEREO
 from coec.io.images import Inspector
 from coec.io.logs import LossCounter
 from coec.io.recordings.clocks import offset_cause
-from coec.io.zenoh.bus import Bus, InputSample, StreamInput
+from coec.io.zenoh.bus import Bus, InputSample, StreamInput, direct
 from coec.io.zenoh.ros_node import RosSide, RosTopicList, listed
 from coec.schemas.documents import Finding
 from coec.schemas.keys import TF_STATIC
@@ -177,8 +177,7 @@ def _count_elsewhere(client: zenoh.Session, samples: StreamSamples) -> list[zeno
     def count(sample: zenoh.Sample) -> None:
         samples.elsewhere += sample.kind == zenoh.SampleKind.PUT
 
-    receiver = zenoh.handlers.Callback(count, indirect=False)
-    return [client.declare_subscriber(expression, receiver) for expression in samples.expressions]
+    return [client.declare_subscriber(expression, direct(count)) for expression in samples.expressions]
 
 
 class _PairSubscription:
@@ -249,7 +248,7 @@ class _PairSubscription:
             samples.count(received)
             waiting.append((time.time_ns(), received))
 
-        return session.declare_subscriber(expression, zenoh.handlers.Callback(receive, indirect=False))
+        return session.declare_subscriber(expression, direct(receive))
 
 
 def stream_findings(

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final
 
 import numpy as np
 import zenoh
@@ -31,7 +31,7 @@ from coec.io.recordings.layouts import RecordingSource
 from coec.io.recordings.window_cutting import RECORDED_GAP_S
 from coec.io.serialise import degrees_or_null, matrix_of
 from coec.io.user_files import read_bytes
-from coec.io.zenoh.bus import StreamInput, input_of
+from coec.io.zenoh.bus import StreamInput, direct, input_of
 from coec.io.zenoh.player import repeated, shifted
 from coec.schemas.keys import Keys
 from coec.schemas.message import from_json, from_msgpack
@@ -282,8 +282,6 @@ PATIENCE_S = 5.0
 BUSY_S = 0.2
 """Time after which the newest pair so far is shown, even if more samples wait."""
 
-T = TypeVar("T")
-
 _SILENT = logging.Logger("view")
 _SILENT.addHandler(logging.NullHandler())
 
@@ -484,11 +482,11 @@ class ServiceWatch:
     def listening(self) -> Iterator[None]:
         """Subscribe to changes, and to whether a service serves the pair."""
         subscribers = [
-            self._session.declare_subscriber(key, _directly(self._listener(kind, None)))
+            self._session.declare_subscriber(key, direct(self._listener(kind, None)))
             for kind, key in self._keys.items()
         ]
         token = self._session.liveliness().declare_subscriber(
-            self._alive_key, _directly(self._on_liveliness), history=True
+            self._alive_key, direct(self._on_liveliness), history=True
         )
         try:
             yield
@@ -503,7 +501,7 @@ class ServiceWatch:
         if now_s - self._requested_s >= QUERY_S:
             self._requested_s = now_s
             for kind, key in self._keys.items():
-                handler = _directly(self._on_reply(self._listener(kind, now_s)))
+                handler = direct(self._on_reply(self._listener(kind, now_s)))
                 # Any other mode of consolidation keeps the answers in Zenoh until the query ends.
                 self._session.get(key, handler, consolidation=zenoh.ConsolidationMode.NONE, timeout=QUERY_S)
         while self._received:
@@ -555,10 +553,6 @@ class ServiceWatch:
 
     def _on_liveliness(self, sample: zenoh.Sample) -> None:
         self._alive = sample.kind == zenoh.SampleKind.PUT
-
-
-def _directly(callback: Callable[[T], None]) -> zenoh.handlers.Callback[T]:
-    return zenoh.handlers.Callback(callback, indirect=False)
 
 
 def _rigid(transform: Transform) -> Matrix4:
@@ -663,5 +657,4 @@ class SensorStreams:
                 return
             inbox.put(stream, source.read(sample))
 
-        handler: Callable[[zenoh.Sample], None] = receive
-        return self._session.declare_subscriber(key, zenoh.handlers.Callback(handler, indirect=False))
+        return self._session.declare_subscriber(key, direct(receive))

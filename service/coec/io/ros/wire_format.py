@@ -92,9 +92,6 @@ class Publisher:
 TOKENS: Final = "@ros2_lv"
 """First chunk of all liveliness tokens; a chunk that starts with `@` is not matched by `**`."""
 
-HASHLESS: Final = "TypeHashNotSupported"
-"""Humble writes this in place of the hash of the type."""
-
 CPU_BACKEND: Final = "/backends:cpu:"
 """Suffix of a subscriber's token. Without it Lyrical sends messages with large arrays to a key specific to the
 token."""

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
 import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
@@ -233,7 +233,7 @@ class Bus:
         """Call `on_sample` for every put on the stream, on Zenoh's thread. Returns a function that ends this."""
         receive = self._receiver(stream, on_sample)
         token = self._shown(stream)
-        declared = [self._session.declare_subscriber(each, _direct(receive)) for each in stream.expressions]
+        declared = [self._session.declare_subscriber(each, direct(receive)) for each in stream.expressions]
         self._subscribers += declared
 
         def end() -> None:
@@ -255,7 +255,7 @@ class Bus:
             subscriber = declare_advanced_subscriber(
                 self._session,
                 expression,
-                _direct(receive),
+                direct(receive),
                 allowed_origin=zenoh.Locality.REMOTE,
                 history=HistoryConfig(detect_late_publishers=True, max_samples=LATCHED_SAMPLES),
                 recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
@@ -293,7 +293,7 @@ class Bus:
                 _log.exception("a query failed", extra={"fields": {"key": key}})
                 query.drop()
 
-        self._queryables.append(self._session.declare_queryable(key, _direct(receive), complete=complete))
+        self._queryables.append(self._session.declare_queryable(key, direct(receive), complete=complete))
 
     def publish(self, key: str, answer: Answer) -> None:
         """Put a value; it is silently lost while there is no router."""
@@ -396,7 +396,8 @@ def _answer_from(
             _log.debug("a reply could not be delivered")
 
 
-def _direct(callback: Callable[..., None]) -> zenoh.handlers.Callback[object]:
+def direct(callback: Callable[..., None]) -> zenoh.handlers.Callback[Any]:
+    """A handler that calls on Zenoh's own threads, without a queue in between."""
     return zenoh.handlers.Callback(callback, indirect=False)
 
 

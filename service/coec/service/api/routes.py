@@ -167,7 +167,11 @@ class VehicleRoutes:
             Route(keys.health(name), lambda request: pair.health(_format(request)), QueryLane.AT_ONCE),
             self._metered(Route(keys.history(name), lambda request: _history(pair, request), QueryLane.FILES)),
             Route(keys.windows(name), lambda request: pair.calibrated.windows(_format(request)), QueryLane.FILES),
-            Route(keys.evidence(name), lambda request: _evidence_list(pair, request), QueryLane.FILES),
+            Route(
+                keys.evidence(name),
+                lambda request: answer_of(pair.calibrated.events(), _format(request)),
+                QueryLane.FILES,
+            ),
             self._metered(Route(keys.overlay(name), lambda request: _overlay(pair, request), QueryLane.DRAWING)),
         )
         return {route.key: route for route in routes}
@@ -209,11 +213,6 @@ def _overlay(pair: AnyPairAnswers, request: Request) -> Answer:
 def _history(pair: AnyPairAnswers, request: Request) -> Answer:
     selector = bus_keys.parse_history_selector(request.parameters)
     return answer_of(pair.calibrated.history(selector.since_ns, selector.until_ns, selector.limit), selector.format)
-
-
-def _evidence_list(pair: AnyPairAnswers, request: Request) -> Answer:
-    form = _format(request)
-    return answer_of(pair.calibrated.events(), form)
 
 
 def _format(request: Request) -> bus_keys.Format:
