@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from coec_lab.experiments import plots
+from coec_lab.experiments.evaluation_schema import FramesPoint, SlicePoint, Spread
 from coec_lab.experiments.objective_scans import Scan, Views
-from coec_lab.experiments.solve_statistics import FrameCountStatistics, SliceStatistics, SpreadStatistics
 
-FLAT = SpreadStatistics(0.01, 0.02, 0.03)
-EXACT = SpreadStatistics(0.0, 0.0, 0.0)
+FLAT = Spread(median=0.01, p95=0.02, max=0.03)
+EXACT = Spread(median=0.0, p95=0.0, max=0.0)
 
 
 def _size(png: bytes) -> tuple[int, int]:
@@ -40,16 +40,26 @@ def test_flat_landscape() -> None:
 
 @pytest.mark.parametrize("with_translation", [False, True])
 @pytest.mark.parametrize("errors", [FLAT, EXACT])
-def test_error_against_frames(with_translation: bool, errors: SpreadStatistics) -> None:
-    points = [FrameCountStatistics(frames, 5, 0.8, errors, errors, np.nan) for frames in (1, 2, 5)]
+def test_error_against_frames(with_translation: bool, errors: Spread) -> None:
+    points = [
+        FramesPoint(frames=count, subsets=5, hit_rate=0.8, rotation_deg=errors, translation_m=errors, sigma_deg=None)
+        for count in (1, 2, 5)
+    ]
     _size(plots.error_against_frames(points, with_translation, "title"))
 
 
 def test_error_against_one_number_of_frames() -> None:
-    _size(plots.error_against_frames([FrameCountStatistics(1, 1, 1.0, FLAT, FLAT, 0.01)], False, "title"))
+    point = FramesPoint(frames=1, subsets=1, hit_rate=1.0, rotation_deg=FLAT, translation_m=FLAT, sigma_deg=0.6)
+    _size(plots.error_against_frames([point], False, "title"))
 
 
 @pytest.mark.parametrize("with_translation", [False, True])
 def test_error_against_slice(with_translation: bool) -> None:
-    points = [SliceStatistics(length, 5, 2.0, 20, 0.8, FLAT, FLAT, 0.02) for length in (7.5, 15.0, 120.0)]
+    points = [
+        SlicePoint(
+            length_s=length_s, slices=5, pairs=2.0, solves=20, hit_rate=0.8, rotation_deg=FLAT, translation_m=FLAT,
+            sigma_deg=1.1,
+        )
+        for length_s in (7.5, 15.0, 120.0)
+    ]  # fmt: skip
     _size(plots.error_against_slice(points, with_translation, "title"))

@@ -2,14 +2,16 @@
 
 from collections.abc import Sequence
 from math import degrees
-from typing import cast
+from typing import Any, cast
+
+import numpy as np
 
 from coec.reports.page_parts import finite_degrees, finite_or_none, finite_values
 from coec.schemas.replies import Maybe6
 from coec_lab.experiments import evaluation_schema as wire
 from coec_lab.experiments import solve_statistics
 from coec_lab.experiments.detection import TriedCheck, table
-from coec_lab.experiments.solve_statistics import BIN_EDGES, CONFIDENCES, Halves, NormalisedErrors
+from coec_lab.experiments.solve_statistics import BIN_EDGES, CONFIDENCES, Halves, NormalisedErrors, SolveOutcome
 
 
 def spread_of(spread: solve_statistics.SpreadStatistics, scale: float = 1.0) -> wire.Spread:
@@ -26,30 +28,29 @@ def angle_spread_of(spread_rad: solve_statistics.SpreadStatistics) -> wire.Sprea
     return spread_of(spread_rad, degrees(1.0))
 
 
-def frames_point_of(point: solve_statistics.FrameCountStatistics) -> wire.FramesPoint:
-    """Errors of windows of one number of frames."""
-    return wire.FramesPoint(
-        frames=point.frames,
-        subsets=point.subsets,
-        hit_rate=point.hit_rate,
-        rotation_deg=angle_spread_of(point.rotation_rad),
-        translation_m=spread_of(point.translation_m),
-        sigma_deg=finite_or_none(degrees(point.sigma_rad)),
-    )
+def frames_point(frames: int, outcomes: Sequence[SolveOutcome]) -> wire.FramesPoint:
+    """Figures of windows of `frames` frames, from at least one outcome."""
+    return wire.FramesPoint(frames=frames, subsets=len(outcomes), **_errors_of(outcomes))
 
 
-def slice_point_of(point: solve_statistics.SliceStatistics) -> wire.SlicePoint:
-    """Errors of windows from slices of one length."""
+def slice_point(length_s: float, slices: Sequence[tuple[int, Sequence[SolveOutcome]]]) -> wire.SlicePoint:
+    """Figures of slices of one length, each given as its frames and outcomes; at least one outcome in all."""
+    outcomes = [outcome for _, of_slice in slices for outcome in of_slice]
+    pairs = float(np.median([frames for frames, _ in slices]))
     return wire.SlicePoint(
-        length_s=point.length_s,
-        slices=point.slices,
-        pairs=point.frames,
-        solves=point.solves,
-        hit_rate=point.hit_rate,
-        rotation_deg=angle_spread_of(point.rotation_rad),
-        translation_m=spread_of(point.translation_m),
-        sigma_deg=finite_or_none(degrees(point.sigma_rad)),
+        length_s=length_s, slices=len(slices), pairs=pairs, solves=len(outcomes), **_errors_of(outcomes)
     )
+
+
+def _errors_of(outcomes: Sequence[SolveOutcome]) -> dict[str, Any]:
+    """Share of hits, errors of hits and misses alike, and the standard deviation that the solves claim, by the names
+    that the points have for them."""
+    return {
+        "hit_rate": sum(outcome.hit for outcome in outcomes) / len(outcomes),
+        "rotation_deg": angle_spread_of(solve_statistics.spread(outcome.rotation_rad for outcome in outcomes)),
+        "translation_m": spread_of(solve_statistics.spread(outcome.translation_m for outcome in outcomes)),
+        "sigma_deg": finite_or_none(degrees(solve_statistics.claimed_rotation_rad(outcomes))),
+    }
 
 
 def halves_of(halves: Halves) -> wire.HalvesReport:

@@ -14,9 +14,10 @@ from coec.reports.close_ups import Caption
 from coec.reports.page import Block, Text
 from coec_lab.experiments import evaluation_charts, objective_scans, plots, solve_experiments, solve_statistics
 from coec_lab.experiments.evaluation_charts import bullseye
+from coec_lab.experiments.evaluation_schema import FramesPoint, SlicePoint
 from coec_lab.experiments.evaluation_tables import setting, verdict
 from coec_lab.experiments.solve_experiments import SUBSETS, Bench
-from coec_lab.experiments.solve_statistics import FrameCountStatistics, NormalisedErrors, SliceStatistics, SolveOutcome
+from coec_lab.experiments.solve_statistics import NormalisedErrors, SolveOutcome
 
 LANDSCAPE = (
     "The objective and its cues along each axis about the reference, from their lowest to their highest value: a "
@@ -49,8 +50,8 @@ def write(
     bench: Bench,
     of_starts: Starts,
     outcomes: Sequence[SolveOutcome],
-    frames: Sequence[FrameCountStatistics],
-    slices: Sequence[SliceStatistics],
+    frames: Sequence[FramesPoint],
+    slices: Sequence[SlicePoint],
     on_progress: Callable[[int, str], None],
 ) -> EvaluationBlocks:
     """Writes the bullseye, landscapes, errors against the amount of data where they were asked for, and the worst start

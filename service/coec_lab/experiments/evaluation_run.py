@@ -25,13 +25,11 @@ from coec.reports.page_parts import finite_degrees
 from coec.schemas.replies import Vector6
 from coec_lab.experiments import evaluation_documents, mount_steps, solve_experiments, solve_statistics
 from coec_lab.experiments.detection import require_enough
-from coec_lab.experiments.evaluation_schema import DetectionReport, EvaluationReport, StepRow
+from coec_lab.experiments.evaluation_schema import DetectionReport, EvaluationReport, FramesPoint, SlicePoint, StepRow
 from coec_lab.experiments.solve_experiments import Bench, Stages
 from coec_lab.experiments.solve_statistics import (
-    FrameCountStatistics,
     Halves,
     NormalisedErrors,
-    SliceStatistics,
     SolveOutcome,
 )
 
@@ -91,8 +89,8 @@ class Experiments:
 
     from_reference: SolveOutcome
     outcomes: list[SolveOutcome] = field(default_factory=list)
-    frames: tuple[FrameCountStatistics, ...] = ()
-    slices: tuple[SliceStatistics, ...] = ()
+    frames: tuple[FramesPoint, ...] = ()
+    slices: tuple[SlicePoint, ...] = ()
     halves: Halves | None = None
     normalised: dict[str, NormalisedErrors] = field(default_factory=dict)
     detection: DetectionReport | None = None
@@ -272,8 +270,8 @@ def report_of(
         verdicts=summary.verdicts,
         stop_reasons=summary.stop_reasons,
         worst_start=solve_statistics.worst(done.outcomes),
-        frames=tuple(evaluation_documents.frames_point_of(point) for point in done.frames),
-        slices=tuple(evaluation_documents.slice_point_of(point) for point in done.slices),
+        frames=done.frames,
+        slices=done.slices,
         halves=None if done.halves is None else evaluation_documents.halves_of(done.halves),
         detection=done.detection,
         steps=done.steps,

@@ -23,6 +23,7 @@ from coec.calibration.baseline import PaperLimits
 from coec.reports.console import AXIS_NAMES
 from coec_lab.experiments import evaluation_charts, solve_statistics
 from coec_lab.experiments.depth_quality import DepthQuality, Pairing
+from coec_lab.experiments.evaluation_schema import FramesPoint, SlicePoint, Spread
 from coec_lab.experiments.matrix_statistics import normalised_errors
 from coec_lab.experiments.objective_scans import Scan, Views
 from coec_lab.experiments.paper_figures import MOVES_DEG, FailureFigures
@@ -215,9 +216,7 @@ def landscape(curves: Mapping[str, Views], title: str) -> bytes:
     return png(figure)
 
 
-def error_against_frames(
-    points: Sequence[solve_statistics.FrameCountStatistics], with_translation: bool, title: str
-) -> bytes:
+def error_against_frames(points: Sequence[FramesPoint], with_translation: bool, title: str) -> bytes:
     """Median and 95th percentile of the error over subsets, and the σ that the solves claim, by the number of frames;
     below, the share of hits."""
     frames = [float(point.frames) for point in points]
@@ -226,12 +225,10 @@ def error_against_frames(
     )
 
 
-def error_against_slice(
-    points: Sequence[solve_statistics.SliceStatistics], with_translation: bool, title: str
-) -> bytes:
+def error_against_slice(points: Sequence[SlicePoint], with_translation: bool, title: str) -> bytes:
     """Like `error_against_frames`, by the length of the slice, with the number of frames in it."""
     lengths_s = [point.length_s for point in points]
-    labels = [f"{point.length_s:.3g} s\n{point.frames:g} fr." for point in points]
+    labels = [f"{point.length_s:.3g} s\n{point.pairs:g} fr." for point in points]
     return _errors(points, lengths_s, labels, "length of the slice and frames in it (median)", with_translation, title)
 
 
@@ -245,7 +242,7 @@ def _plot_scan(axes: Axes, name: str, scan: Scan, lowest: float, height: float) 
 
 
 def _errors(
-    points: Sequence[solve_statistics.FrameCountStatistics] | Sequence[solve_statistics.SliceStatistics],
+    points: Sequence[FramesPoint] | Sequence[SlicePoint],
     at: Sequence[float],
     labels: Sequence[str],
     what: str,
@@ -258,11 +255,11 @@ def _errors(
     _plot_errors(
         panels[0, 0],
         at,
-        [_in_degrees(point.rotation_rad) for point in points],
+        [point.rotation_deg for point in points],
         "rotation error, deg",
         evaluation_charts.HIT_DEG,
     )
-    claimed = [degrees(point.sigma_rad) for point in points]
+    claimed = _known([point.sigma_deg for point in points])
     panels[0, 0].plot(at, claimed, "^:", color="tab:purple", label="σ claimed (root of the three variances), median")
     if with_translation:
         _plot_errors(
@@ -283,11 +280,9 @@ def _errors(
     return png(figure)
 
 
-def _plot_errors(
-    axes: Axes, at: Sequence[float], errors: Sequence[solve_statistics.SpreadStatistics], label: str, limit: float
-) -> None:
-    axes.plot(at, [error.p95 for error in errors], "s--", label="95th percentile")
-    axes.plot(at, [error.median for error in errors], "o-", label="median")
+def _plot_errors(axes: Axes, at: Sequence[float], errors: Sequence[Spread], label: str, limit: float) -> None:
+    axes.plot(at, _known([error.p95 for error in errors]), "s--", label="95th percentile")
+    axes.plot(at, _known([error.median for error in errors]), "o-", label="median")
     axes.axhline(limit, color="grey", linewidth=0.8, linestyle=":", label=f"limit of a hit, {limit:g}")
     axes.set_yscale("log")
     axes.set_ylabel(label)
@@ -301,8 +296,9 @@ def _tick(axes: Axes) -> None:
     axes.minorticks_off()
 
 
-def _in_degrees(errors: solve_statistics.SpreadStatistics) -> solve_statistics.SpreadStatistics:
-    return solve_statistics.SpreadStatistics(degrees(errors.median), degrees(errors.p95), degrees(errors.max))
+def _known(values: Sequence[float | None]) -> NDArray[np.float64]:
+    """(n,) the values, NaN where there is none."""
+    return np.array(values, dtype=np.float64)
 
 
 def normalised(by_reference: Mapping[str, solve_statistics.NormalisedErrors], title: str) -> bytes:

@@ -24,8 +24,10 @@ from coec.io.depth.depth_maps import CachedDepth
 from coec.io.images import CachedGreys, GreyImages
 from coec_lab.experiments import solve_statistics
 from coec_lab.experiments.detection import TriedCheck, try_detection
+from coec_lab.experiments.evaluation_documents import frames_point, slice_point
+from coec_lab.experiments.evaluation_schema import FramesPoint, SlicePoint
 from coec_lab.experiments.mount_steps import MOUNT_STEPS, MountStepTrial, try_mount_steps
-from coec_lab.experiments.solve_statistics import FrameCountStatistics, SliceStatistics, SolveOutcome, Trial
+from coec_lab.experiments.solve_statistics import SolveOutcome, Trial
 
 GOLDEN_ANGLE_RAD = pi * (3.0 - sqrt(5.0))
 """The turn between neighbours of a Fibonacci lattice (Á. González, "Measurement of areas on a sphere using Fibonacci
@@ -209,7 +211,7 @@ def from_starts(bench: Bench, poses: Sequence[Matrix4], stages: Stages) -> Itera
         yield outcome
 
 
-def against_frames(bench: Bench, poses: Sequence[Matrix4], stages: Stages) -> tuple[FrameCountStatistics, ...]:
+def against_frames(bench: Bench, poses: Sequence[Matrix4], stages: Stages) -> tuple[FramesPoint, ...]:
     """Solves with different numbers of frames. Every number gets the same starts, spread over all `poses`, so that only
     the numbers of frames are compared."""
     available = len(bench.window.pairs)
@@ -221,7 +223,7 @@ def against_frames(bench: Bench, poses: Sequence[Matrix4], stages: Stages) -> tu
         for trial in range(SUBSETS):
             outcomes.append(bench.solve(_spread(poses, trial), frame_subset(available, frames, trial)))
             on_progress(row * SUBSETS + trial + 1, f"{frames} of {available}")
-        points.append(solve_statistics.frames_point(frames, outcomes))
+        points.append(frames_point(frames, outcomes))
     return tuple(points)
 
 
@@ -231,7 +233,7 @@ def against_slice(
     cut: Callable[[float, float], Window],
     poses: Sequence[Matrix4],
     stages: Stages,
-) -> tuple[SliceStatistics, ...]:
+) -> tuple[SlicePoint, ...]:
     """Solves on slices of several lengths. Every length gets the same starts, divided among slices at several places of
     the recording, the first at its beginning.
 
@@ -269,7 +271,7 @@ def against_slice(
                 on_progress(row * SUBSETS + done, f"{length_s:.1f} s")
             outcomes.append((len(window.pairs), solved))
         if outcomes:
-            points.append(solve_statistics.slice_point(length_s, outcomes))
+            points.append(slice_point(length_s, outcomes))
     return tuple(points)
 
 

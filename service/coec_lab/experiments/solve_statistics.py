@@ -124,36 +124,6 @@ class Statistics:
         return (self.verdicts.accepted_hits + self.verdicts.failed_misses) / self.starts
 
 
-@dataclass(frozen=True, slots=True)
-class FrameCountStatistics:
-    """Errors over several subsets of one number of frames, hits and misses alike.
-
-    `sigma_rad` is the standard deviation of the rotation that the solves claim (median; NaN where none does): the root
-    of the sum of the variances about the three axes, to compare with the errors.
-    """
-
-    frames: int
-    subsets: int
-    hit_rate: float
-    rotation_rad: SpreadStatistics
-    translation_m: SpreadStatistics
-    sigma_rad: float
-
-
-@dataclass(frozen=True, slots=True)
-class SliceStatistics:
-    """Errors over several slices of one length in seconds, hits and misses alike; `frames` is the median per slice."""
-
-    length_s: float
-    slices: int
-    frames: float
-    solves: int
-    hit_rate: float
-    rotation_rad: SpreadStatistics
-    translation_m: SpreadStatistics
-    sigma_rad: float
-
-
 def score(trial: Trial, reference: Matrix4, dof: int) -> SolveOutcome:
     """The trial against the reference (4, 4); with 6 degrees of freedom a hit needs the translation too."""
     estimate = trial.estimate
@@ -205,33 +175,6 @@ def summarise(outcomes: Sequence[SolveOutcome]) -> Statistics:
     )
 
 
-def frames_point(frames: int, outcomes: Sequence[SolveOutcome]) -> FrameCountStatistics:
-    """Figures of windows of `frames` frames, from at least one outcome."""
-    return FrameCountStatistics(
-        frames=frames,
-        subsets=len(outcomes),
-        hit_rate=sum(outcome.hit for outcome in outcomes) / len(outcomes),
-        rotation_rad=spread(outcome.rotation_rad for outcome in outcomes),
-        translation_m=spread(outcome.translation_m for outcome in outcomes),
-        sigma_rad=_claimed_rotation_rad(outcomes),
-    )
-
-
-def slice_point(length_s: float, slices: Sequence[tuple[int, Sequence[SolveOutcome]]]) -> SliceStatistics:
-    """Figures of slices of one length, each given as its frames and outcomes; at least one outcome in all."""
-    outcomes = [outcome for _, of_slice in slices for outcome in of_slice]
-    return SliceStatistics(
-        length_s=length_s,
-        slices=len(slices),
-        frames=float(np.median([frames for frames, _ in slices])),
-        solves=len(outcomes),
-        hit_rate=sum(outcome.hit for outcome in outcomes) / len(outcomes),
-        rotation_rad=spread(outcome.rotation_rad for outcome in outcomes),
-        translation_m=spread(outcome.translation_m for outcome in outcomes),
-        sigma_rad=_claimed_rotation_rad(outcomes),
-    )
-
-
 def stop_reason(outcome: SolveOutcome) -> str:
     """Why the search of an outcome ended."""
     estimate = outcome.trial.estimate
@@ -259,7 +202,7 @@ def _claimed(hits: Sequence[SolveOutcome]) -> NDArray[np.float64]:
     return np.array([np.median(column) if len(column) else np.nan for column in known])
 
 
-def _claimed_rotation_rad(outcomes: Sequence[SolveOutcome]) -> float:
+def claimed_rotation_rad(outcomes: Sequence[SolveOutcome]) -> float:
     """Median claimed standard deviation of the rotation, over the outcomes with a claim."""
     sigmas = [outcome.trial.estimate.sigma[:3] for outcome in outcomes if outcome.trial.estimate is not None]
     claims = [float(np.linalg.norm(sigma)) for sigma in sigmas if np.isfinite(sigma).all()]

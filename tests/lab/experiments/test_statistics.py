@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from coec.calibration.types import Decision, Estimate, Optimum, StopReason, Uncertainty, Verdict
 from coec.geometry import se3
+from coec_lab.experiments.evaluation_documents import frames_point, slice_point
 from coec_lab.experiments.solve_statistics import (
     NOT_SOLVED,
     SolveOutcome,
     Trial,
-    frames_point,
     score,
-    slice_point,
     spread,
     summarise,
     worst,
@@ -165,17 +164,17 @@ def test_spread_of_seconds() -> None:
 def test_frames_point_counts_hits_and_misses() -> None:
     point = frames_point(5, [_outcome(0.1), _outcome(2.0), _outcome(0.3), _outcome(0.2)])
     assert (point.frames, point.subsets, point.hit_rate) == (5, 4, 0.75)
-    assert point.rotation_rad.max == pytest.approx(radians(2.0))
+    assert point.rotation_deg.max == pytest.approx(2.0)
 
 
 def test_claims_about_the_rotation_are_the_root_of_the_sum_of_variances() -> None:
     point = frames_point(5, [_outcome(0.1, sigma=0.01), _outcome(0.1, sigma=0.03), _outcome(0.1, sigma=np.nan)])
-    assert point.sigma_rad == pytest.approx(np.sqrt(3.0) * 0.02)
-    assert np.isnan(frames_point(1, [_outcome(0.1, sigma=np.nan)]).sigma_rad)
+    assert point.sigma_deg == pytest.approx(np.degrees(np.sqrt(3.0) * 0.02))
+    assert frames_point(1, [_outcome(0.1, sigma=np.nan)]).sigma_deg is None
 
 
 def test_slice_point_takes_the_slices_together() -> None:
     point = slice_point(7.5, [(3, [_outcome(0.1), _outcome(2.0)]), (5, [_outcome(0.3)]), (9, [_outcome(0.2)])])
-    assert (point.length_s, point.slices, point.frames, point.solves) == (7.5, 3, 5.0, 4)
+    assert (point.length_s, point.slices, point.pairs, point.solves) == (7.5, 3, 5.0, 4)
     assert point.hit_rate == 0.75
-    assert point.rotation_rad.max == pytest.approx(radians(2.0))
+    assert point.rotation_deg.max == pytest.approx(2.0)
