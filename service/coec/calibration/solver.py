@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.frames.ego_mask import MIN_FRAMES, MIN_SPEED_MPS, lit_pixels
 from coec.calibration.frames.motion_compensation import EVERY, Choice, compensate
+from coec.calibration.frames.sweep_evidence import stands
 from coec.calibration.objective import mutual_information
 from coec.calibration.objective.edges import EdgeCue, build_edges, independent_samples_at
 from coec.calibration.objective.fused import FusedObjective, Fusion
@@ -182,12 +183,15 @@ def prepare_window_data(
 
 
 def _masked(data: WindowData) -> WindowData:
+    pairs = data.window.pairs
+    if all(pair.motion is None for pair in pairs) and stands([pair.lidar for pair in pairs]):
+        return data  # its surroundings would pass for the vehicle's body
     images = CachedImages(data.images)
     data = replace(data, images=images)
-    first_images = data._each("images", lambda index: images.first(data.window.pairs[index].camera))
+    first_images = data._each("images", lambda index: images.first(pairs[index].camera))
     moving = (
         grey
-        for grey, pair in zip(first_images, data.window.pairs, strict=True)
+        for grey, pair in zip(first_images, pairs, strict=True)
         if pair.motion is None or not pair.motion.stays_below(MIN_SPEED_MPS)
     )
     rig = data.window.rig

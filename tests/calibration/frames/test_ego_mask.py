@@ -200,6 +200,14 @@ def test_frames_of_a_vehicle_that_is_known_to_stand_do_not_count(sharp_street: W
     assert prepare_window_data(standing, stereo, GREY, CalibrationConfig(), Silence()).window.rig.mask is None
 
 
+def test_without_odometry_the_sweeps_show_whether_the_vehicle_stands(sharp_street: Window, stereo: DepthModel) -> None:
+    unknown = [replace(pair, motion=None) for pair in sharp_street.pairs]
+    moving = replace(sharp_street, rig=replace(sharp_street.rig, mask=None), pairs=tuple(unknown))
+    assert prepare_window_data(moving, stereo, GREY, CalibrationConfig(), Silence()).window.rig.mask is not None
+    standing = replace(moving, pairs=tuple(replace(pair, lidar=unknown[0].lidar) for pair in unknown))
+    assert prepare_window_data(standing, stereo, GREY, CalibrationConfig(), Silence()).window.rig.mask is None
+
+
 def test_the_mask_of_the_rig_is_left_alone(sharp_street: Window, stereo: DepthModel) -> None:
     given = np.ones((sharp_street.rig.camera.height, sharp_street.rig.camera.width), np.bool_)
     masked = replace(sharp_street, rig=replace(sharp_street.rig, mask=given))
@@ -235,6 +243,14 @@ def test_a_real_drive_with_nothing_in_the_way_has_no_mask(sample_data: Path, cam
 
 def test_a_real_room_with_a_standing_car_has_no_mask(sample_data: Path) -> None:
     assert lit_pixels(recorded(str(sample_data / "fisheye_garage"))) is None
+
+
+@pytest.mark.parametrize("recording", ["tamu_right_os", "tamu_right_vlp"])
+def test_a_dark_garage_behind_a_moving_board_is_not_masked(
+    sample_data: Path, stereo: DepthModel, recording: str
+) -> None:
+    window = window_cutting.load_window(str(sample_data / recording / "dataset.yaml"), None, 25, lambda *_: None).window
+    assert prepare_window_data(window, stereo, GREY, CalibrationConfig(), Silence()).window.rig.mask is None
 
 
 def test_a_second_of_slow_traffic_has_no_mask(sample_data: Path) -> None:

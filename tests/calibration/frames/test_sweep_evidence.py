@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from coec.calibration.frames.motion_compensation import sensor_twist
-from coec.calibration.frames.sweep_evidence import clouds_in_turn, compensated_for, instants_s, sectors
+from coec.calibration.frames.sweep_evidence import clouds_in_turn, compensated_for, instants_s, sectors, stands
 from coec.calibration.types import EgoMotion, LidarFrame
 from coec.geometry import se3
 from coec.geometry.sweep_kernels import deskew
@@ -105,3 +105,38 @@ def test_a_fixed_view_is_no_part(width_deg: float) -> None:
     assert clouds_in_turn([covered(rng.normal(-35.0, 1.0), width_deg) for _ in range(24)]) == 1
     assert clouds_in_turn([]) == 1
     assert clouds_in_turn([covered(0.0, width_deg)]) == 1
+
+
+def seen_from(places_m: NDArray[np.float64], rng: np.random.Generator) -> list[LidarFrame]:
+    """Sweeps of a wood on flat ground from some places (N, 3), with somebody who walks about at two metres."""
+    trees = rng.uniform((-40.0, -40.0, -2.0), (40.0, 40.0, 8.0), (6_000, 3))
+    trees = trees[np.hypot(trees[:, 0], trees[:, 1]) > 3.0]
+    elevation, azimuth = np.radians(np.mgrid[-24.5:-5.0:1.0, 0.25:360.0:0.5]).reshape(2, -1)
+    ground = (
+        np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)], axis=1) * (-2.0 / np.tan(elevation))[:, None]
+    )
+    sweeps = []
+    for place_m in places_m:
+        angle = 2.0 * np.pi * rng.random()
+        somebody = rng.uniform(-1.0, 1.0, (400, 3)) * (0.3, 0.3, 1.0) + (2.0 * np.cos(angle), 2.0 * np.sin(angle), 0.0)
+        xyz_m = np.concatenate([trees - place_m, ground, somebody])
+        xyz_m *= 1.0 + rng.normal(0.0, 0.02, (len(xyz_m), 1)) / np.linalg.norm(xyz_m, axis=1, keepdims=True)
+        sweeps.append(LidarFrame(0, "lidar", xyz_m.astype(np.float32)))
+    return sweeps
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_people_before_a_standing_vehicle_do_not_make_it_move(seed: int) -> None:
+    assert stands(seen_from(np.zeros((6, 3)), np.random.default_rng(seed)))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_vehicle_that_moves_does_not_stand_though_the_ground_is_the_same_everywhere(seed: int) -> None:
+    assert not stands(seen_from(np.arange(6)[:, None] * np.array([1.5, 0.2, 0.0]), np.random.default_rng(seed)))
+
+
+def test_sweeps_without_points_show_no_standing_vehicle() -> None:
+    empty = LidarFrame(0, "lidar", np.zeros((0, 3), np.float32))
+    assert not stands([])
+    assert not stands([empty])
+    assert not stands([empty, empty])

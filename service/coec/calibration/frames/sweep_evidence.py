@@ -1,5 +1,5 @@
-"""What the points of sweeps show of how they were written: whether their driver has compensated them for motion, and
-how many clouds make up a turn.
+"""What the points of sweeps show: whether their driver has compensated them for motion, how many clouds make up a turn,
+and whether the vehicle stood.
 
 A LiDAR that turns evenly measures along each beam at azimuths that grow linearly with time. Compensation for the motion
 of the vehicle spoils that, by degrees for points beside a vehicle at some metres per second, and undoing it restores
@@ -128,3 +128,37 @@ def clouds_in_turn(covered: Sequence[NDArray[np.bool_]]) -> int:
         if np.mean(np.array(turns) >= COVERING * whole) >= AGREEING:
             return count
     return 1
+
+
+UNCHANGED_SHARE = 0.8
+"""The vehicle stood if at least this share of the directions have the same range in two sweeps. A flat ground and the
+walls of a straight road are alike wherever a vehicle is; people and boards before a standing one change few. See
+docs/measured.md."""
+
+SAME_RANGE, SAME_RANGE_M = 0.02, 0.1
+"""Ranges are the same if they differ by at most this share, or by so much."""
+
+
+def stands(sweeps: Sequence[LidarFrame]) -> bool:
+    """Whether the vehicle stood at one place while some sweeps were recorded: most pairs of sweeps that are half of
+    them apart show the same ranges."""
+    nearest, half = [_nearest_m(sweep) for sweep in sweeps], len(sweeps) // 2
+    shares = []
+    for one, other in zip(nearest, nearest[half:] if half else [], strict=False):
+        seen = np.isfinite(one) & np.isfinite(other)
+        same = np.abs(one[seen] - other[seen]) <= np.maximum(SAME_RANGE_M, SAME_RANGE * one[seen])
+        shares.append(float(same.mean()) if len(same) else 0.0)
+    return bool(shares) and float(np.median(shares)) >= UNCHANGED_SHARE
+
+
+def _nearest_m(sweep: LidarFrame) -> NDArray[np.float64]:
+    """(180 · 360,) the range of the nearest point in each square degree of elevation and azimuth, m; infinite without a
+    point."""
+    xyz_m = sweep.xyz_m.astype(np.float64)
+    xyz_m = xyz_m[np.isfinite(xyz_m).all(axis=1)]
+    azimuth = np.floor(np.degrees(np.arctan2(xyz_m[:, 1], xyz_m[:, 0]))).astype(np.int64) % 360
+    elevation = np.degrees(np.arctan2(xyz_m[:, 2], np.hypot(xyz_m[:, 0], xyz_m[:, 1])))
+    row = np.clip(np.floor(elevation) + 90.0, 0.0, 179.0).astype(np.int64)
+    nearest_m = np.full(180 * 360, np.inf)
+    np.minimum.at(nearest_m, row * 360 + azimuth, lengths(xyz_m))
+    return nearest_m
