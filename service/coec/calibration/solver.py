@@ -17,8 +17,8 @@ from coec.calibration.frames.sweep_evidence import stands
 from coec.calibration.objective import mutual_information
 from coec.calibration.objective.edges import EdgeCue, build_edges, independent_samples_at
 from coec.calibration.objective.fused import FusedObjective, Fusion
-from coec.calibration.search.global_search import at_rim, basin_next_to, find_basins
-from coec.calibration.search.local_search import SearchResult, box_of, maximise, near, polish_in_turn
+from coec.calibration.search.global_search import at_rim, basin_next_to, find_basins, highest_summit
+from coec.calibration.search.local_search import TRANSLATIONS, SearchResult, box_of, maximise, near, polish_in_turn
 from coec.calibration.types import (
     CameraFrame,
     CueShare,
@@ -266,6 +266,9 @@ def by_fusion(data: WindowData, config: CalibrationConfig) -> EstimatorResult:
     polished = polish_basins(fusion, ranked, config.search, data.progress)
     summits = choose_basin(fusion, polished, window)
     edges = edges.balanced_at(summits[0])
+    if config.search.dof > TRANSLATIONS.start:
+        summits = (highest_summit(edges, summits[0]), *summits)
+        edges = edges.balanced_at(summits[0])
     count = Metric("range_edges", edges.effective_count, least_range_edges(config), at_least=True)
     metrics = (count, *basin_metrics(fusion, polished, summits[0], config))
     objective, search = settle_basin(fusion, edges, summits, polished.evaluations, data, config)

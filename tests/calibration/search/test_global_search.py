@@ -1,5 +1,6 @@
 """The global stage: an even cover of the reach, and the true basin from far away."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,21 @@ from calibration.conftest import window_of
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.objective.edges import EdgeCue, build_edges, in_reach
 from coec.calibration.objective.mutual_information import SearchBox
-from coec.calibration.search.global_search import AT_RIM, FINE, ROUNDS, at_rim, basin_next_to, find_basins, sample_reach
+from coec.calibration.search.global_search import (
+    AT_RIM,
+    FINE,
+    ROUNDS,
+    SUMMIT_MARGIN,
+    at_rim,
+    basin_next_to,
+    find_basins,
+    highest_summit,
+    sample_reach,
+)
 from coec.calibration.types import Matrix4, Window
 from coec.config import LimitsConfig
 from coec.geometry import se3
+from coec.geometry.edges.alignment import significances
 from coec.geometry.edges.charts import charted_significances
 from coec.io.images import GreyImages
 from coec.io.recordings.layouts import open_source
@@ -184,3 +196,31 @@ def test_edges_out_of_reach_are_nothing_to_the_bit(sharp_street: Window, sharp_e
     assert retained.xyz_m.shape[1] < charts.xyz_m.shape[1]
     poses = sample_reach(start, BOTH, 200)
     assert charted_significances(retained, poses).tolist() == charted_significances(charts, poses).tolist()
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("turned", "shifted"), [(0, 4), (1, 3)])
+def test_a_pose_on_the_side_of_a_valley_is_led_to_the_summit_of_the_sharpest_edges(
+    sharp_street: Window, sharp_edges: EdgeCue, turned: int, shifted: int, sign: float
+) -> None:
+    truth = sharp_street.rig.T_camera_lidar_nominal
+    step = np.zeros(6)
+    # A shift upwards with the turn that leaves things at ten metres where they are; to the side it turns the other way.
+    step[turned], step[shifted] = sign * np.radians(0.5), sign * (1 if turned == 0 else -1) * 10.0 * np.radians(0.5)
+    off = se3.perturb(truth, step)
+    end = highest_summit(sharp_edges, off)
+    of_truth, of_off, of_end = significances(sharp_edges.sharp, np.array([truth, off, end]))
+    assert of_off < 0.8 * of_truth
+    assert of_end > of_truth - SUMMIT_MARGIN
+    assert angle_deg(end, truth) < 0.1
+
+
+def test_a_summit_is_left_where_it_is(sharp_street: Window, sharp_edges: EdgeCue) -> None:
+    summit = highest_summit(sharp_edges, sharp_street.rig.T_camera_lidar_nominal)
+    assert highest_summit(sharp_edges, summit) is summit
+
+
+def test_edges_out_of_view_lead_nowhere(sharp_street: Window, sharp_edges: EdgeCue) -> None:
+    behind = se3.perturb(sharp_street.rig.T_camera_lidar_nominal, np.array([np.pi, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    alone = replace(sharp_edges, sharp=sharp_edges.sharp.of_points(np.zeros(0, np.int64)))
+    assert highest_summit(alone, behind) is behind

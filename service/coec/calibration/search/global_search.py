@@ -16,6 +16,7 @@ from coec.calibration.objective.edges import EdgeCue, in_reach
 from coec.calibration.objective.mutual_information import SearchBox
 from coec.calibration.types import Matrix4
 from coec.geometry import se3
+from coec.geometry.edges.alignment import AscentStart, EdgeFrames, ascend, significances
 from coec.geometry.edges.charts import (
     EdgeCharts,
     charted_significances,
@@ -24,7 +25,7 @@ from coec.geometry.edges.charts import (
     select_separated,
     unit_ball,
 )
-from coec.geometry.points import lengths
+from coec.geometry.points import lengths, thinned
 
 COVER_RAD = radians(0.9)
 """Distance between the poses of the cover: less than the blur of the coarsest level on common lenses."""
@@ -156,6 +157,51 @@ def basin_next_to(edges: EdgeCue, pose: Matrix4, reach: SearchBox) -> Matrix4:
     return np.asarray(end[0])
 
 
+SUMMIT_SPACING_RAD = (radians(0.5), radians(1.0))
+"""Shifts that lead to other summits of a basin, as angles seen from the nearest edges. See docs/measured.md."""
+
+SUMMIT_STEPS_RAD = (radians(0.2), radians(0.1), radians(0.05), radians(0.025))
+"""Steps of the climbs from there."""
+
+SUMMIT_REACH = SearchBox(radians(5.0), 0.5)
+"""How far these climbs may lead."""
+
+SUMMIT_POINTS = 5_000
+"""Most range edges of these climbs."""
+
+SUMMIT_TURNS = 3
+"""How often they begin again beside the end of the last ones."""
+
+SUMMIT_MARGIN = 1.0
+"""How much more significant another summit has to be, standard deviations: less may be chance."""
+
+
+def highest_summit(edges: EdgeCue, pose: Matrix4) -> Matrix4:
+    """The most significant summit (4, 4) on the sharpest edges that climbs from `pose` (4, 4) and from beside it lead
+    to.
+
+    Where all is near, a basin has several summits: turns and shifts make up for each other along a valley, and each
+    edge of a pattern along it meets one image edge after the other. Blurred edges show one summit where these are.
+    """
+    seen = in_reach(edges.sharp, edges.half_view_rad, pose, SUMMIT_REACH)
+    few = seen.of_points(thinned(len(seen.weight), SUMMIT_POINTS))
+    near_m, unit = _near_m(few), np.eye(6)
+    turns, shifts = unit[:3], near_m * unit[3:]
+    one_way = np.array([*turns, *shifts, shifts[0] - turns[1], shifts[1] + turns[0]])
+    moves = np.array([[se3.perturbation(step * move) for move in (*one_way, *-one_way)] for step in SUMMIT_STEPS_RAD])
+    highest = float(significances(seen, pose[None])[0])
+    for _ in range(SUMMIT_TURNS):
+        starts = [pose, *(other for turn in SUMMIT_SPACING_RAD for other in shifted(pose[None], near_m * turn, near_m))]
+        ascents = ascend(few, [AscentStart(start, 0, len(few.maps)) for start in starts], moves)
+        ends = np.array([ascent.pose for ascent in ascents])
+        z = significances(seen, ends)
+        best = int(np.argmax(z))
+        if z[best] <= highest + SUMMIT_MARGIN:
+            break
+        pose, highest = ends[best], float(z[best])
+    return pose
+
+
 def sample_reach(start: Matrix4, reach: SearchBox, count: int) -> NDArray[np.float64]:
     """(count, 4, 4) poses that cover the reach evenly."""
     return _Cover(start, reach, count).poses(np.arange(count))
@@ -193,8 +239,8 @@ def _promising(charts: EdgeCharts, start: Matrix4, reach: SearchBox) -> NDArray[
     return poses[separated(poses, z, ROUNDS[0].poses, ROUNDS[0].separation_rad)]
 
 
-def _near_m(charts: EdgeCharts) -> float:
-    nearest_m = float(np.percentile(lengths(charts.xyz_m.T), NEAREST_PERCENT)) if len(charts.weight) else np.inf
+def _near_m(edges: EdgeCharts | EdgeFrames) -> float:
+    nearest_m = float(np.percentile(lengths(edges.xyz_m.T), NEAREST_PERCENT)) if len(edges.weight) else np.inf
     return min(max(nearest_m, LEAST_NEAR_M), se3.METRES_PER_RADIAN)
 
 

@@ -332,25 +332,39 @@ def _fits(
     for name, prior in priors.items():
         if name != NOMINAL:
             fits.append((name, _alternative(levels, name, general, nominal, places, of_nominal, prior)))
-    start = np.zeros(SIZE)
-    start[: SHIFTS.stop] = general.deviation[: SHIFTS.stop]
-    share = nominal.independent_share
-    end = ascent(levels[-2:], start, places, of_nominal, share)
-    sigma = np.sqrt(with_deletion.diagonal()[: SHIFTS.stop])
-    least = nominal.log_posterior + log(NEGLIGIBLE)
-    if end.log_posterior < least or not _is_away(end.deviation, nominal.mean, sigma):
-        return fits
-    other = fit_gaussian(sharp, end.deviation, places, of_nominal, share, effort=ROUGH, share_is_known=True)
-    if _is_away(other.mean, nominal.mean, sigma):
-        # As wide as the nominal mode: edges that fit nothing are wide, and are no mode.
-        evidence = nominal.log_evidence + other.log_posterior - nominal.log_posterior
-        fits.append((OTHER_MODE, replace(other, log_evidence=evidence)))
-    return fits
+    other = _other_mode(levels, general, nominal, np.sqrt(with_deletion.diagonal()), places, of_nominal)
+    return fits if other is None else [*fits, (OTHER_MODE, other)]
+
+
+def _other_mode(
+    levels: Sequence[AssumedEdges],
+    general: Ascent,
+    nominal: GaussianFit,
+    sigma: Vector,
+    places: tuple[int, ...],
+    prior: Vector,
+) -> GaussianFit | None:
+    """The most probable mode of the nominal hypothesis that is another than that of its Gaussian, of standard
+    deviations `sigma` (13,); None if there is none. It is looked for from the given pose, which the Gaussian may have
+    left for a lower and wider mode, and from that of the general optimum."""
+    share, of_general = nominal.independent_share, np.zeros(SIZE)
+    of_general[: SHIFTS.stop] = general.deviation[: SHIFTS.stop]
+    least, modes = nominal.log_posterior + log(NEGLIGIBLE), []
+    for start, leading in ((np.zeros(SIZE), levels[-1:]), (of_general, levels[-2:])):
+        end = ascent(leading, start, places, prior, share)
+        if end.log_posterior < least or not _is_away(end.deviation, nominal.mean, sigma):
+            continue
+        mode = fit_gaussian(levels[-1], end.deviation, places, prior, share, effort=ROUGH, share_is_known=True)
+        if _is_away(mode.mean, nominal.mean, sigma):
+            # As wide as the nominal mode: edges that fit nothing are wide, and are no mode.
+            evidence = nominal.log_evidence + mode.log_posterior - nominal.log_posterior
+            modes.append(replace(mode, log_evidence=evidence))
+    return max(modes, key=lambda mode: mode.log_evidence, default=None)
 
 
 def _is_away(deviation: Vector, mean: Vector, sigma: Vector) -> bool:
-    """Whether the pose of a deviation (13,) is another mode than that of a mean (13,) with standard deviations (6,)."""
-    return float(np.max(np.abs((deviation - mean)[: SHIFTS.stop]) / sigma)) >= SAME_MODE
+    """Whether the pose of a deviation (13,) is another mode than that of a mean (13,), of standard deviations (13,)."""
+    return float(np.max(np.abs(deviation - mean)[: SHIFTS.stop] / sigma[: SHIFTS.stop])) >= SAME_MODE
 
 
 def _nominal(
