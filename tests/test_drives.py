@@ -17,13 +17,15 @@ TINY = "sim:seconds=0.4&camera_hz=5&lidar_hz=5&camera=fisheye64&lidar=16&depth=y
 
 SCRIPT = f"""
 import sys
+import coec_lab.simulation.drive
+of_drive = set(sys.modules)
 from coec_lab.simulation.source import open_sim
 from coec.io.recordings.recording_source import parse_spec
 before = set(sys.modules)
 for _ in open_sim(parse_spec({TINY!r}).query).messages():
     pass
-new = (name for name in sys.modules if name.split(".")[0] in ("coec", "coec_lab") and name not in before)
-print(*(sys.modules[name].__file__ for name in new))
+drawing = (name for name in sys.modules if name in of_drive or name not in before)
+print(*(sys.modules[name].__file__ for name in drawing if name.split(".")[0] in ("coec", "coec_lab")))
 """
 
 
@@ -32,7 +34,7 @@ def test_every_module_that_drawing_loads_is_in_the_fingerprint() -> None:
     done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, env=environment(), check=True)
     loaded = {Path(name) for name in done.stdout.split()}
     assert any(path.name == "render.py" for path in loaded)
-    assert loaded <= simulated_drives.modules_behind(simulated_drives.SERVICE / "coec_lab" / "simulation" / "drive.py")
+    assert loaded <= simulated_drives.modules_behind(*simulated_drives.ROOTS)
 
 
 def test_a_rendered_drive_is_the_drive() -> None:

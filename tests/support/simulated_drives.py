@@ -31,7 +31,12 @@ SERVICE = REPOSITORY / "service"
 CACHE = REPOSITORY / ".pytest_cache" / "d" / "drives"
 """Where `pytest --cache-clear` clears."""
 
-ROOTS = ("drive.py", "rig_drive.py")
+ROOTS = (
+    *(SERVICE / "coec_lab" / "simulation" / name for name in ("drive.py", "rig_drive.py")),
+    *(SERVICE / "coec" / "geometry" / "cameras").glob("*.py"),
+)
+"""What draws, and the lenses, which are imported by their names."""
+
 PACKAGES = ("coec", "coec_lab")
 
 LIBRARIES = ("embreex", "numba", "numpy", "opencv-python-headless")
@@ -103,7 +108,7 @@ def _fingerprint() -> str:
     digest = hashlib.sha256(sys.version.encode())
     for library in LIBRARIES:
         digest.update(f"{library} {version(library)}\n".encode())
-    for path in sorted(modules_behind(*(SERVICE / "coec_lab" / "simulation" / root for root in ROOTS))):
+    for path in sorted(modules_behind(*ROOTS)):
         digest.update(f"{path.relative_to(SERVICE)}\n".encode() + path.read_bytes())
     return digest.hexdigest()[:16]
 
