@@ -4,6 +4,7 @@ at once; and for which processors."""
 from __future__ import annotations
 
 import os
+import shutil
 import stat
 import subprocess
 import sys
@@ -94,6 +95,41 @@ def test_the_import_sets_it_unless_the_user_has(tmp_path: Path) -> None:
     assert ours.parent == tmp_path / "cache" / "coec"
     theirs = _numba_cache_directory(cache_home | {"NUMBA_CACHE_DIR": str(tmp_path / "mine")})
     assert theirs == str(tmp_path / "mine")
+
+
+COMPILES = """
+from coec.geometry import compilation_events
+with compilation_events.listening(print):
+    import numpy
+    from coec.geometry.images import level_counts
+    level_counts(numpy.zeros((4, 4), numpy.uint8), 1)
+"""
+
+
+def _compiled(checkout: Path, cache: Path) -> bool:
+    """Whether a process with the program from another place compiles a kernel."""
+    environment = {"PYTHONPATH": str(checkout), "XDG_CACHE_HOME": str(cache), "NUMBA_CACHE_DIR": ""}
+    command = [sys.executable, "-c", COMPILES]
+    done = subprocess.run(
+        command, env=os.environ | environment, capture_output=True, text=True, check=True, cwd=checkout
+    )
+    return bool(done.stdout)
+
+
+def test_a_program_that_is_installed_again_detects_its_kernels_and_an_edited_one_does_not(tmp_path: Path) -> None:
+    source = Path(coec.__file__).parent
+    first, again, edited = (tmp_path / name for name in ("first", "again", "edited"))
+    for checkout in (first, again, edited):
+        (checkout / "coec").mkdir(parents=True)
+        shutil.copytree(source / "geometry", checkout / "coec" / "geometry", copy_function=shutil.copyfile)
+        for module in source.glob("*.py"):
+            shutil.copyfile(module, checkout / "coec" / module.name)
+    formula = edited / "coec" / "geometry" / "cameras" / "pinhole.py"
+    formula.write_text(formula.read_text() + "\n# edited\n")
+    assert _compiled(first, tmp_path / "cache")
+    assert not _compiled(first, tmp_path / "cache")
+    assert not _compiled(again, tmp_path / "cache")
+    assert _compiled(edited, tmp_path / "cache")
 
 
 def test_only_processors_that_hold_their_clock_use_registers_of_512_bits() -> None:

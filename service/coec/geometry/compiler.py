@@ -2,7 +2,9 @@
 formulas of the camera models registered, and with prefetching of memory.
 
 The directory is keyed by a hash of the sources in `coec.geometry`. numba itself only looks at the file that holds the
-outermost kernel, so that after an edit to a camera formula it would use a stale kernel from another file.
+outermost kernel, so that after an edit to a camera formula it would use a stale kernel from another file. It also keys
+a kernel by the place and the time of that file, so that a program that is installed again would compile all of them
+again. Those of this program are keyed by what their files say.
 
 The camera model is chosen at compile time, by the type of the camera. A kernel therefore needs no branch and no code
 per model, and numba caches it on disk, which it does not do for a kernel that takes a function as an argument.
@@ -30,7 +32,7 @@ import numpy as np
 from llvmlite import ir
 from numba import njit, prange, types
 from numba.core import cgutils, event
-from numba.core.caching import IndexDataCacheFile
+from numba.core.caching import CacheImpl, IndexDataCacheFile, _CacheLocator
 from numba.core.codegen import get_host_cpu_features
 from numba.core.cpu_options import ParallelOptions
 from numba.extending import intrinsic, overload, register_jitable
@@ -60,6 +62,9 @@ loop of every operation on an array, however short, and each of those takes a se
 
 # Twelve hexadecimal digits are 48 bits, enough to distinguish the edits of one code base.
 _HASH_DIGITS = 12
+
+_PACKAGES = ("coec", "coec_lab")
+"""The packages of this program."""
 
 _FRESH = "coec-fresh-"
 """How the name of a directory begins that only one process uses."""
@@ -169,9 +174,46 @@ os.environ.setdefault("GOMP_SPINCOUNT", "3000")
 if numba.config.CPU_FEATURES is None:  # type: ignore[attr-defined]  # features set by the user win
     numba.config.CPU_FEATURES = with_wide_registers(get_host_cpu_features())  # type: ignore[attr-defined]
 
+_GEOMETRY = Path(__file__).parent
+
 if not os.environ.get("NUMBA_CACHE_DIR"):  # a directory set by the user wins
     # mypy does not know the attribute: numba's configuration module fills itself at run time.
-    numba.config.CACHE_DIR = str(kernel_cache_directory(Path(__file__).parent))  # type: ignore[attr-defined]
+    numba.config.CACHE_DIR = str(kernel_cache_directory(_GEOMETRY))  # type: ignore[attr-defined]
+
+
+class _BySource(_CacheLocator):
+    """Keys a kernel of this program by its module, the sources of `coec.geometry` and its own file."""
+
+    _OF_GEOMETRY = _sources_hash(_GEOMETRY)
+
+    def __init__(self, kernel: Callable[..., Any], file: str) -> None:
+        folder, _, _ = kernel.__module__.rpartition(".")
+        self._folder = str(Path(numba.config.CACHE_DIR, folder))  # type: ignore[attr-defined]
+        self._line = kernel.__code__.co_firstlineno
+        self._stamp = self._OF_GEOMETRY, hashlib.sha256(Path(file).read_bytes()).hexdigest()
+
+    @classmethod
+    def from_function(cls, kernel: Callable[..., Any], file: str) -> "_BySource | None":
+        if kernel.__module__.partition(".")[0] not in _PACKAGES or not Path(file).is_file():
+            return None
+        locator = cls(kernel, file)
+        try:
+            locator.ensure_cache_path()
+        except OSError:
+            return None  # numba's own locators then find another place, or none
+        return locator
+
+    def get_cache_path(self) -> str:
+        return self._folder
+
+    def get_source_stamp(self) -> tuple[str, str]:
+        return self._stamp
+
+    def get_disambiguator(self) -> str:
+        return str(self._line)
+
+
+CacheImpl._locator_classes.insert(0, _BySource)
 
 
 _save = IndexDataCacheFile.save
