@@ -266,14 +266,15 @@ def by_fusion(data: WindowData, config: CalibrationConfig) -> EstimatorResult:
     polished = polish_basins(fusion, ranked, config.search, data.progress)
     summits = choose_basin(fusion, polished, window)
     edges = edges.balanced_at(summits[0])
+    contrast = basin_metrics(fusion, polished, summits[0], config)
     if config.search.dof > TRANSLATIONS.start:
-        summits = (highest_summit(edges, summits[0]), *summits)
-        edges = edges.balanced_at(summits[0])
+        highest = highest_summit(edges, summits[0])
+        if highest is not summits[0]:
+            summits, edges = (highest, *summits), edges.balanced_at(highest)
     count = Metric("range_edges", edges.effective_count, least_range_edges(config), at_least=True)
-    metrics = (count, *basin_metrics(fusion, polished, summits[0], config))
     objective, search = settle_basin(fusion, edges, summits, polished.evaluations, data, config)
     cues = objective.cue_shares(edges, search.T_camera_lidar, config.search.dof)
-    return EstimatorResult(objective, search, metrics, edges, cues)
+    return EstimatorResult(objective, search, (count, *contrast), edges, cues)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
