@@ -25,6 +25,7 @@ from coec.service.worker.job_queue import (
     STOPPING,
     SUPERSEDED,
     WAITING,
+    WINDOW_WAITS_S,
     JobQueue,
     Lane,
     Ticket,
@@ -573,7 +574,9 @@ class QueueMachine(RuleBasedStateMachine):
     def next_one(self) -> Followed | None:
         """The job whose turn it is, if it is one's."""
         order = [Lane.CHECK, Lane.LIVE, Lane.ERRAND]
-        if self.check_was_fatal:
+        window = next((job for job in self.waiting if job.lane is Lane.LIVE), None)
+        has_waited = window is not None and self.now_s - window.requested_s > WINDOW_WAITS_S
+        if self.check_was_fatal or has_waited:
             order = [Lane.LIVE, Lane.CHECK, Lane.ERRAND]
         if not self.prefetches:
             order += [Lane.BACKLOG, Lane.COMMISSIONING]

@@ -102,8 +102,8 @@ PROBLEMS: Mapping[str, Problem] = {
         "Nothing if it happens once; if it repeats, check its memory (`worker.max_memory_bytes`) and the log.",
     ),
     "compiling_kernels": Problem(
-        "The worker compiles its kernels, once on a machine and after an update; the text gives the progress. "
-        "Meanwhile the extrinsic is served and windows are recorded; checks and solves start afterwards.",
+        "The worker compiles its kernels, once on a machine, and after an update that changes them; the text gives the "
+        "progress. Meanwhile the extrinsic is served and windows are recorded; checks and solves start afterwards.",
         "Nothing: it takes a minute, and longer on a busy machine. `coec warmup` compiles the kernels beforehand.",
     ),
     "recording_failed": Problem(
