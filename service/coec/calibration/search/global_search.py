@@ -7,7 +7,7 @@ reach brings into view are left out. Nothing is random: the same input gives the
 """
 
 from dataclasses import dataclass
-from math import cos, pi, radians
+from math import cos, pi, radians, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,8 @@ from coec.geometry.edges.charts import (
     unit_ball,
 )
 from coec.geometry.points import lengths, thinned
+
+GOLDEN = (1.0 + sqrt(5.0)) / 2.0
 
 COVER_RAD = radians(0.9)
 """Distance between the poses of the cover: less than the blur of the coarsest level on common lenses."""
@@ -77,14 +79,23 @@ ROUNDS = (
 its own chart, which is how the true pose is found: on a coarse chart hundreds of layouts that happen to fit may rank
 above it. See docs/measured.md."""
 
-SHIFTED_POSES, SHIFT_RAD = 6, radians(2.0)
+SHIFTS = np.array([[0, a, b] for a in (1.0, -1.0) for b in (GOLDEN, -GOLDEN)])
+SHIFTS = 0.65 / np.linalg.norm(SHIFTS[0]) * np.concatenate([np.zeros((1, 3)), *(np.roll(SHIFTS, k, 1) for k in range(3))])
+"""(13, 3) shifts that cover the unit ball: its centre, and the corners of an icosahedron. If translation is searched,
+the poses that begin the first round are tried with each, because the cover has few translations for each rotation. See
+docs/measured.md."""
+
+SHIFTED_POSES, SHIFT_RAD = 16, radians(2.0)
 """If translation is searched, each of this many best poses is shifted either way along each axis by this angle as seen
 from the nearest edges, and the shifted poses climb again. This is needed because poses of one rotation do not count as
 apart, so their translation was chosen on the coarse chart, which hardly shows it. See docs/measured.md."""
 
-SHIFT_TURNS, SHIFT_SPAN_M = 2, 0.5
-"""How often that is done at least, each time with the best poses so far; and how far it leads at least: the translation
-of the cover may be that far off, which in a room is many shifts."""
+SHIFT_TURNS, SHIFT_SPAN_M = 3, 0.5
+"""How often that is done at least, each time with the best poses so far that were not shifted yet; and how far it leads
+at least: the translation of the cover may be that far off, which in a room is many shifts."""
+
+SHIFT_RANKS = 60
+"""A pose that so many better ones lie apart from is not shifted."""
 
 TURNED_FOR = 1.4
 """A shift to the side or upwards is also tried with the turn that leaves things at this multiple of the distance of the
@@ -138,11 +149,17 @@ def find_basins(edges: EdgeCue, start: Matrix4, reach: SearchBox) -> list[Basin]
     near_m = _near_m(finest)
     shift_m = near_m * SHIFT_RAD
     turns = max(SHIFT_TURNS, round(SHIFT_SPAN_M / shift_m)) if reach.translation_m > 0.0 else 0
+    are_shifted = np.zeros(len(poses), np.bool_)
     for _ in range(turns):
-        best = separated(poses, z, SHIFTED_POSES, ROUNDS[-1].separation_rad)
+        best = separated(poses, z, SHIFT_RANKS, ROUNDS[-1].separation_rad)
+        best = best[~are_shifted[best]][:SHIFTED_POSES]
+        if not len(best):
+            break
+        are_shifted[best] = True
         moved = _within(shifted(poses[best], shift_m, TURNED_FOR * near_m), start, reach)
         more, _ = _pattern_searched(finest, moved, SHIFTED, start, reach)
         poses, z = np.concatenate([poses, more]), np.concatenate([z, charted_significances(finest, more)])
+        are_shifted = np.concatenate([are_shifted, np.zeros(len(more), np.bool_)])
     z = charted_significances(finest, poses)
     return [Basin(poses[k], float(z[k])) for k in separated(poses, z, len(poses), ROUNDS[-1].separation_rad)]
 
@@ -236,7 +253,19 @@ def _promising(charts: EdgeCharts, start: Matrix4, reach: SearchBox) -> NDArray[
     for begin in range(0, len(best), BLOCK):
         poses[1 + begin : 1 + begin + BLOCK] = cover.poses(best[begin : begin + BLOCK])
     z = charted_significances(charts, poses)
-    return poses[separated(poses, z, ROUNDS[0].poses, ROUNDS[0].separation_rad)]
+    poses = poses[separated(poses, z, ROUNDS[0].poses, ROUNDS[0].separation_rad)]
+    return poses if reach.translation_m == 0.0 else _with_best_shifts(screen, poses, start, reach)
+
+
+def _with_best_shifts(
+    charts: EdgeCharts, poses: NDArray[np.float64], start: Matrix4, reach: SearchBox
+) -> NDArray[np.float64]:
+    """(K, 4, 4) each of some poses (K, 4, 4) with its own shift from the start, or that of `SHIFTS` which fits best."""
+    tried = np.repeat(poses[:, None], 1 + len(SHIFTS), axis=1)
+    unmoved_m = -poses[:, :3, :3] @ se3.inverse(start)[:3, 3]
+    tried[:, 1:, :3, 3] = unmoved_m[:, None] + reach.translation_m * SHIFTS
+    z = charted_significances(charts, tried.reshape(-1, 4, 4)).reshape(len(poses), -1)
+    return np.asarray(tried[np.arange(len(poses)), z.argmax(axis=1)])
 
 
 def _near_m(edges: EdgeCharts | EdgeFrames) -> float:
