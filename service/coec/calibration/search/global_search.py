@@ -7,7 +7,7 @@ reach brings into view are left out. Nothing is random: the same input gives the
 """
 
 from dataclasses import dataclass
-from math import cos, pi, radians, sqrt
+from math import cos, hypot, pi, radians, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +26,6 @@ from coec.geometry.edges.charts import (
     unit_ball,
 )
 from coec.geometry.points import lengths, thinned
-
-GOLDEN = (1.0 + sqrt(5.0)) / 2.0
 
 COVER_RAD = radians(0.9)
 """Distance between the poses of the cover: less than the blur of the coarsest level on common lenses."""
@@ -79,11 +77,16 @@ ROUNDS = (
 its own chart, which is how the true pose is found: on a coarse chart hundreds of layouts that happen to fit may rank
 above it. See docs/measured.md."""
 
-SHIFTS = np.array([[0, a, b] for a in (1.0, -1.0) for b in (GOLDEN, -GOLDEN)])
-SHIFTS = 0.65 / np.linalg.norm(SHIFTS[0]) * np.concatenate([np.zeros((1, 3)), *(np.roll(SHIFTS, k, 1) for k in range(3))])
+SHIFT_SHARE = 0.65
+"""Distance of the tried shifts from the middle of the reach, as a share of its radius. See docs/measured.md."""
+
+GOLDEN = (1.0 + sqrt(5.0)) / 2.0
+
+CORNERS = [np.roll([0.0, a, b], k) for k in range(3) for a in (1.0, -1.0) for b in (GOLDEN, -GOLDEN)]
+
+SHIFTS = SHIFT_SHARE * np.array([np.zeros(3), *(corner / hypot(1.0, GOLDEN) for corner in CORNERS)])
 """(13, 3) shifts that cover the unit ball: its centre, and the corners of an icosahedron. If translation is searched,
-the poses that begin the first round are tried with each, because the cover has few translations for each rotation. See
-docs/measured.md."""
+the poses that begin the first round are tried with each, because the cover has few translations for each rotation."""
 
 SHIFTED_POSES, SHIFT_RAD = 16, radians(2.0)
 """If translation is searched, each of this many best poses is shifted either way along each axis by this angle as seen
