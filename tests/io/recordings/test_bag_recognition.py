@@ -74,6 +74,13 @@ def turns(parts: int = 1, timed: bool = True, compensated: bool = False, count: 
     return messages
 
 
+def of_turn(number: int, shift_m: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
+    sweep = turning_sweep(number)
+    assert sweep.ring is not None
+    x, y, z = (sweep.xyz_m + shift_m).T
+    return {"x": x, "y": y, "z": z, "ring": sweep.ring}
+
+
 def opened(folder: Path, messages: list[Message], query: str = "") -> BagRecording:
     recording = open_source(f"{Bag(messages).write(folder / 'bag.mcap')}{query}")
     assert isinstance(recording, BagRecording)
@@ -111,6 +118,21 @@ def test_parts_of_a_turn_are_joined(tmp_path: Path, timed: bool) -> None:
         assert one.time_offset_s is not None
         assert np.ptp(one.time_offset_s) == pytest.approx(0.1 if timed else 0.08, abs=0.002)
         assert one.ring is not None
+
+
+def test_the_origin_is_checked_once_a_second(tmp_path: Path) -> None:
+    def moved(numbers: set[int]) -> list[Message]:
+        clouds = turns(count=30)
+        return [
+            cloud(SECOND + k * 100 * MS, of_turn(k, np.array([0.0, 0.0, 2.0]))) if k in numbers else clouds[k]
+            for k in range(30)
+        ]
+
+    recording = opened(tmp_path, [*ELSE, *odometry(), *moved({4})])
+    assert len(sweeps(recording)) == 30
+    recording = opened(tmp_path, [*ELSE, *odometry(), *moved({10})])
+    with pytest.raises(SourceError, match="The points contradict their origin"):
+        sweeps(recording)
 
 
 def test_a_person_says_how_many_clouds_make_a_sweep(tmp_path: Path) -> None:

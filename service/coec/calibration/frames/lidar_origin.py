@@ -249,6 +249,10 @@ CONTRADICTED_RAD, EXPLAINED = math.radians(0.5), 0.25
 and an uncompensated metre of driving cause. Another origin explains the points if at most this share of the spread
 remains there."""
 
+PERIOD_NS = 10**9
+"""Sensor time between two checks of the sweeps of a stream, ns: the frame in which a driver sends changes with its
+configuration, not from sweep to sweep, and a check takes some ms."""
+
 GIVE_UP = 5
 """After this many sweeps in a row that no cones explain, the LiDAR counts as one whose points lie on none."""
 

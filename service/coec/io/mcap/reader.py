@@ -159,7 +159,7 @@ def read_records(stream: BinaryIO, *, max_unpacked_bytes: int | None = None) -> 
                 raise McapDamagedError(f"byte {at}: the file unpacks to more than {max_unpacked_bytes} bytes")
             yield from _chunk_records(chunk, at)
         else:
-            yield from _parse(opcode, body, body_at, None)
+            yield from _parse(opcode, memoryview(body), body_at, None)
         at = body_at + length
 
 
@@ -171,7 +171,7 @@ class MessageReader:
         self._stream = stream
         self._size = _size(stream)
         self._chunk_at: int | None = None
-        self._chunk = b""
+        self._chunk = memoryview(b"")
 
     def read(self, chunk_at: int | None, at: int, length: int) -> bytes:
         """The data of the message that `read_records` found at this place.
@@ -190,7 +190,7 @@ class MessageReader:
             body_at = chunk_at + _PREFIX.size
             self._chunk = _unpack_chunk(_read(self._stream, span, body_at, self._size), body_at)
             self._chunk_at = chunk_at
-        return self._chunk[at : at + length]
+        return bytes(self._chunk[at : at + length])
 
 
 def read_attachment(path: Path, name: str) -> bytes | None:
@@ -257,7 +257,7 @@ def _summary(stream: BinaryIO, size: int) -> tuple[bytes, int]:
 # --- records ------------------------------------------------------------------------------------------------
 
 
-def _chunk_records(chunk: bytes, chunk_at: int) -> Iterator[Record]:
+def _chunk_records(chunk: memoryview, chunk_at: int) -> Iterator[Record]:
     at = 0
     while at < len(chunk):
         if at + _PREFIX.size > len(chunk):
@@ -270,16 +270,17 @@ def _chunk_records(chunk: bytes, chunk_at: int) -> Iterator[Record]:
         at += length
 
 
-def _parse(opcode: int, body: bytes, at: int, chunk_at: int | None) -> Iterator[Record]:
+def _parse(opcode: int, body: memoryview, at: int, chunk_at: int | None) -> Iterator[Record]:
     """Yields the record, or nothing for records that only repeat others (indexes, statistics)."""
     cursor = _Cursor(body, at if chunk_at is None else chunk_at)
     match opcode:
         case Opcode.MESSAGE:
             channel_id, sequence, log_time_ns, _ = cursor.unpack(_MESSAGE)
-            yield McapMessage(channel_id, sequence, log_time_ns, body[_MESSAGE.size :], chunk_at, at + _MESSAGE.size)
+            data = bytes(body[_MESSAGE.size :])
+            yield McapMessage(channel_id, sequence, log_time_ns, data, chunk_at, at + _MESSAGE.size)
         case Opcode.SCHEMA:
             (schema_id,) = cursor.unpack(struct.Struct("<H"))
-            yield Schema(schema_id, cursor.text(), cursor.text(), cursor.blob("<I"))
+            yield Schema(schema_id, cursor.text(), cursor.text(), bytes(cursor.blob("<I")))
         case Opcode.CHANNEL:
             channel_id, schema_id = cursor.unpack(struct.Struct("<HH"))
             yield Channel(channel_id, schema_id, cursor.text(), cursor.text(), cursor.pairs())
@@ -289,20 +290,21 @@ def _parse(opcode: int, body: bytes, at: int, chunk_at: int | None) -> Iterator[
             yield Metadata(cursor.text(), cursor.pairs())
 
 
-def _attachment(body: bytes, at: int) -> McapAttachment:
+def _attachment(body: memoryview, at: int) -> McapAttachment:
     cursor = _Cursor(body, at)
     cursor.take(16)  # log time, create time
-    attachment = McapAttachment(cursor.text(), cursor.text(), cursor.blob("<Q"))
+    attachment = McapAttachment(cursor.text(), cursor.text(), bytes(cursor.blob("<Q")))
     (expected,) = cursor.unpack(struct.Struct("<I"))
     if expected not in (0, zlib.crc32(body[:-4])):
         raise McapDamagedError(f"byte {at}: the CRC of an attachment does not agree")
     return attachment
 
 
-def _unpack_chunk(body: bytes, at: int) -> bytes:
+def _unpack_chunk(body: bytes, at: int) -> memoryview:
     cursor = _Cursor(body, at)
     _, _, promised, expected = cursor.unpack(_CHUNK)
     compression, packed = cursor.text(), cursor.blob("<Q")
+    data: bytes | memoryview
     if promised > MAX_CHUNK_BYTES:
         raise McapDamagedError(f"byte {at}: a chunk would unpack to {promised} bytes, the limit is {MAX_CHUNK_BYTES}")
     try:
@@ -323,7 +325,7 @@ def _unpack_chunk(body: bytes, at: int) -> bytes:
         raise McapDamagedError(f"byte {at}: a chunk cannot be unpacked") from error
     if len(data) != promised or (expected and zlib.crc32(data) != expected):
         raise McapDamagedError(f"byte {at}: size or CRC of a chunk does not agree")
-    return data
+    return memoryview(data)
 
 
 def _size(stream: BinaryIO) -> int:
@@ -344,10 +346,10 @@ def _read(stream: BinaryIO, count: int, at: int, size: int) -> bytes:
 
 
 class _Cursor:
-    """Walks through a record and checks every step against its end."""
+    """Walks through a record and checks every step against its end. It copies nothing."""
 
-    def __init__(self, body: bytes, at: int) -> None:
-        self._body = body
+    def __init__(self, body: bytes | memoryview, at: int) -> None:
+        self._body = memoryview(body)
         self._start = at
         self._offset = 0
 
@@ -361,7 +363,7 @@ class _Cursor:
         """Remaining bytes."""
         return len(self._body) - self._offset
 
-    def take(self, count: int) -> bytes:
+    def take(self, count: int) -> memoryview:
         """The next `count` bytes."""
         if count > self.left:
             raise McapDamagedError(f"byte {self._start}: a length within a record passes its end")
@@ -372,7 +374,7 @@ class _Cursor:
         """The next integers."""
         return layout.unpack(self.take(layout.size))
 
-    def blob(self, length: str) -> bytes:
+    def blob(self, length: str) -> memoryview:
         """The next bytes, preceded by their length."""
         (count,) = self.unpack(struct.Struct(length))
         return self.take(count)
@@ -380,7 +382,7 @@ class _Cursor:
     def text(self) -> str:
         """The next text, UTF-8 preceded by its length in 32 bits."""
         try:
-            return self.blob("<I").decode("utf-8")
+            return str(self.blob("<I"), "utf-8")
         except UnicodeDecodeError as error:
             raise McapDamagedError(f"byte {self._start}: a name is not UTF-8") from error
 

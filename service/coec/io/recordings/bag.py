@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coec.calibration.frames.lidar_origin import NO_SCAN_LINES, ApparentOrigin, SeveralOrigins, from_origin
+from coec.calibration.frames.lidar_origin import NO_SCAN_LINES, PERIOD_NS, ApparentOrigin, SeveralOrigins, from_origin
 from coec.calibration.types import CameraFrame, EgoMotion, Frame, FramePair, LidarFrame, Matrix4, Recognition, Rig
 from coec.config import CalibrationConfig
 from coec.errors import DecodeError, SourceError, UsageError
@@ -245,7 +245,8 @@ class BagRecording:
         return tuple(motion.stamp_ns for motion in self.streams.motions)
 
     def messages(self, cameras: Collection[int] | None = None) -> Iterator[Frame]:
-        """See `Recording.messages`. With chosen camera frames, only the sweep nearest to each of them comes."""
+        """See `Recording.messages`. With chosen camera frames, only the sweep nearest to each of them comes. The origin
+        of the first sweep of each second is checked."""
         selected = [
             self.streams.camera[index] for index in recording_source.selected_indices(cameras, len(self.streams.camera))
         ]
@@ -263,13 +264,18 @@ class BagRecording:
             for kind, items in ((_EGO, motions), (_LIDAR, sweeps), (_CAMERA, selected))
             for number, item in enumerate(items)
         ]
+        checked: LidarFrame | None = None
         with self.storage.open() as reader:
             images = _Images(self.storage, reader, self.streams.video)
             for _, kind, _, item in sorted(queue, key=lambda entry: entry[:3]):
                 if isinstance(item, EgoMotion):
                     yield item
                 elif isinstance(item, Sweep):
-                    yield self._sweep(reader, item)
+                    if checked is not None and checked.stamp_ns // PERIOD_NS != item.stamp_ns // PERIOD_NS:
+                        checked = None
+                    sweep = self._sweep(reader, item, checked)
+                    checked = checked or sweep
+                    yield sweep
                 elif kind != _CAMERA:
                     yield _load(self.storage, reader, item, self.clouds)
                 elif (image := images.load(item)) is not None:
@@ -331,7 +337,7 @@ class BagRecording:
             raise SourceError(f"{self.storage.path}: the {place.type_name} of {place.stamp_ns} ns is no cloud")
         return cloud
 
-    def _sweep(self, reader: BagReader, place: Sweep) -> LidarFrame:
+    def _sweep(self, reader: BagReader, place: Sweep, checked: LidarFrame | None = None) -> LidarFrame:
         clouds = [self._cloud(reader, cloud) for cloud in place.clouds]
         middle_ns = clouds[len(clouds) // 2].stamp_ns
         sweep = replace(bag_recognition.joined(clouds, middle_ns), stamp_ns=place.stamp_ns)
@@ -339,7 +345,13 @@ class BagRecording:
         if self.readings.rings is False:
             sweep = replace(sweep, ring=None)
         return measured_from(
-            sweep, self.T_cloud_lidar, self.rig.lidar_frame, self.storage.path, _ADVICE, self.readings.rings is True
+            sweep,
+            self.T_cloud_lidar,
+            self.rig.lidar_frame,
+            self.storage.path,
+            _ADVICE,
+            self.readings.rings is True,
+            checked,
         )
 
 

@@ -21,7 +21,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.frames.lidar_origin import OriginCheck, from_origin, unordered
+from coec.calibration.frames.lidar_origin import NO_SCAN_LINES, OriginCheck, from_origin, unordered
 from coec.calibration.types import LidarFrame, Matrix4, Recognition
 from coec.config import PointTimeConfig
 from coec.errors import DecodeError, SourceError
@@ -439,15 +439,18 @@ def measured_from(
     where: Path,
     advice: Mapping[str, str],
     has_scan_lines: bool = False,
+    checked: LidarFrame | None = None,
 ) -> LidarFrame:
     """A sweep in the LiDAR's own frame, see `from_origin`; without ring numbers that are no scan lines, unless
-    a person says that they are (`has_scan_lines`).
+    a person says that they are (`has_scan_lines`). A sweep soon after one that was `checked` is as that one.
 
     Raises:
         SourceError: the points are in millimetres, or were not measured from the origin of that frame. The message of
             the latter ends with the entry of `advice` for the cause.
     """
     sweep = from_origin(cloud, T_cloud_lidar, frame_id)
+    if checked is not None:
+        return unordered(sweep) if NO_SCAN_LINES in checked.recognitions else sweep
     median_m = float(np.median(lengths(sweep.xyz_m))) if len(sweep.xyz_m) else 0.0
     if median_m > FARTHEST_MEDIAN_M:
         raise SourceError(

@@ -273,9 +273,6 @@ CAMERA, LIDAR, EGO = "camera", "lidar", "ego"
 WRONG_TYPE = "wrong_type"
 """Cause of a loss: the message is of a type that gives no frame of the stream."""
 
-ORIGIN_PERIOD_NS = 10**9
-"""Sensor time between two checks of the origin from which points were measured, ns. Each check takes 1 ms."""
-
 EXPLAINED = frozenset(
     {
         lidar_origin.ApparentOrigin.cause,
@@ -525,9 +522,8 @@ class Decoder:
 
     def _contradiction(self, sweep: LidarFrame) -> lidar_origin.ApparentOrigin | lidar_origin.SeveralOrigins | None:
         """What in a sweep contradicts the configured origin; None: nothing. Also notes whether rings are scan lines.
-        Looks at the first sweep of each period of sensor time, and at every sweep while there is a contradiction: the
-        frame in which a driver sends changes with its configuration, not from sweep to sweep."""
-        period = sweep.stamp_ns // ORIGIN_PERIOD_NS
+        Looks at the first sweep of each period of sensor time, and at every sweep while there is a contradiction."""
+        period = sweep.stamp_ns // lidar_origin.PERIOD_NS
         if period == self._checked_period and not self._contradicted:
             return None
         self._checked_period = period
