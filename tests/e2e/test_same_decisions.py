@@ -22,7 +22,8 @@ from coec.config import (
     load_config,
 )
 from coec.io.mcap.writer import write_bag
-from coec.service.drive_replay import DriveReplay, differences, read_log
+from coec.service.decision_log import differences, read_log
+from coec.service.drive_replay import DriveReplay
 from e2e.drives import (
     NS_PER_S,
     SECONDS,

@@ -13,12 +13,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, ImageFormat, LidarFrame
+from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, Frame, ImageFormat, LidarFrame
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
 from coec.io.frame_validation import Refusal
 from coec.io.images import encode_depth_png, encode_jpeg, probe
-from coec.io.msgpack_frames import decode_camera, decode_ego, decode_lidar, encode_camera, encode_ego, encode_lidar
+from coec.io.msgpack_frames import (
+    as_decoded,
+    decode_camera,
+    decode_ego,
+    decode_lidar,
+    encode,
+    encode_camera,
+    encode_ego,
+    encode_lidar,
+)
 
 LIMITS = LimitsConfig()
 JPEG = encode_jpeg(np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8))
@@ -110,6 +119,7 @@ def test_fields_of_a_newer_sender_are_ignored() -> None:
 )
 def test_a_camera_frame_there_and_back(frame: CameraFrame) -> None:
     assert decode_camera(encode_camera(frame), LIMITS) == frame
+    assert as_decoded(frame, LIMITS) == frame
 
 
 @pytest.mark.parametrize("columns", [(), ("intensity",), ("intensity", "ring", "time_offset_s")])
@@ -124,19 +134,46 @@ def test_a_sweep_there_and_back(columns: tuple[str, ...]) -> None:
         7, "lidar", rng.normal(size=(50, 3)).astype(np.float32), **{c: given[c] for c in columns}, sequence=9
     )
 
-    back = decode_lidar(encode_lidar(frame), LIMITS)
-
-    assert (back.stamp_ns, back.frame_id, back.sequence) == (7, "lidar", 9)
-    assert back.xyz_m.tobytes() == frame.xyz_m.tobytes()
-    for name, values in given.items():
-        column = getattr(back, name)
-        assert (column is None) if name not in columns else (column.tobytes() == values.tobytes())
+    for back in (decode_lidar(encode_lidar(frame), LIMITS), as_decoded(frame, LIMITS)):
+        assert isinstance(back, LidarFrame)
+        assert (back.stamp_ns, back.frame_id, back.sequence) == (7, "lidar", 9)
+        assert back.xyz_m.tobytes() == frame.xyz_m.tobytes()
+        for name, values in given.items():
+            column = getattr(back, name)
+            assert (column is None) if name not in columns else (column.tobytes() == values.tobytes())
 
 
 def test_an_ego_motion_there_and_back() -> None:
     motion = EgoMotion(2**60, "base_link", (1 / 3, -0.0, 1e-300), (math.pi, 2.0, -3.0), 4)
 
     assert decode_ego(encode_ego(motion), LIMITS) == motion
+    assert as_decoded(motion, LIMITS) == motion
+
+
+SHORT = LimitsConfig(max_message_bytes=2**16, max_points=1024, max_image_pixels=2**12)
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        LidarFrame(7, "lidar", np.zeros((6000, 3), np.float32)),
+        LidarFrame(7, "lidar", np.zeros((1025, 3), np.float32)),
+        LidarFrame(7, "lidar", np.zeros((0, 3), np.float32)),
+        LidarFrame(7, "lidar", np.full((2, 3), NAN, np.float32)),
+        LidarFrame(7, "lidar", np.zeros((2, 3), np.float32), time_offset_s=np.full(2, 11.0, np.float32)),
+        CameraFrame(7, "camera", EncodedImage(ImageFormat.RGB8, 256, 128, bytes(2**16 + 2**15))),
+        CameraFrame(7, "camera", EncodedImage(ImageFormat.MONO8, 128, 64, bytes(2**13))),
+        CameraFrame(7, "camera", EncodedImage(ImageFormat.JPEG, 64, 48, JPEG[:-2])),
+        CameraFrame(7, "camera", EncodedImage(ImageFormat.JPEG, 32, 48, JPEG)),
+    ],
+)
+def test_a_frame_of_a_recording_is_refused_as_its_message_would_be(frame: Frame) -> None:
+    decode = decode_lidar if isinstance(frame, LidarFrame) else decode_camera
+    with pytest.raises(DecodeError) as of_message:
+        decode(encode(frame), SHORT)
+    with pytest.raises(DecodeError) as of_frame:
+        as_decoded(frame, SHORT)
+    assert of_frame.value.reason == of_message.value.reason
 
 
 def test_columns_are_views_of_the_message() -> None:

@@ -6,7 +6,7 @@ import gc
 import json
 import random
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import cast
@@ -19,9 +19,8 @@ from coec.config import Config
 from coec.errors import SourceError
 from coec.service import camera_lidar_pair as runtime_pair
 from coec.service import drive_replay
-from coec.service.drive_replay import (
+from coec.service.decision_log import (
     Decision,
-    DriveReplay,
     ReplayedDrive,
     differences,
     outline,
@@ -29,6 +28,7 @@ from coec.service.drive_replay import (
     write_log,
     write_replay_page,
 )
+from coec.service.drive_replay import DriveReplay, read_ahead
 from coec.service.worker.worker_jobs import WorkerJob
 from service.test_pair_disturbed import streams
 from support.vehicles import BEGIN_S, NS_PER_S, STEP_S, InstantRecorder, OracleWorker, PairBench, pair_configuration
@@ -95,6 +95,41 @@ def test_the_decisions_of_a_drive_do_not_depend_on_the_workers(
     assert [name for name in states if name != "unknown"] == ["healthy", "suspect", "miscalibrated", "healthy"]
     assert drives[0].health == "healthy"
     assert drives[0].driven_s == pytest.approx(200.0, abs=1.0)
+
+
+def frames_of(sizes: Sequence[int], read: list[int]) -> Iterator[LidarFrame]:
+    for stamp_ns, size in enumerate(sizes):
+        read.append(stamp_ns)
+        yield LidarFrame(stamp_ns, "lidar", np.zeros((size, 3), np.float32))
+
+
+def test_frames_are_read_ahead_in_their_order_and_within_the_bytes() -> None:
+    read: list[int] = []
+    most = 12 * 100
+    for number, frame in enumerate(read_ahead(frames_of([40, 70, 300, 1, 1, 90, 20] * 9, read), most)):
+        assert frame.stamp_ns == number
+        assert len(read) <= number + 1 + 1 + 5, "those that wait, and one that has no room"
+    assert read == list(range(63))
+
+
+def test_an_error_of_the_reader_comes_after_the_frames_before_it() -> None:
+    def broken() -> Iterator[LidarFrame]:
+        yield from frames_of([1, 1], [])
+        raise SourceError("cut off")
+
+    frames = read_ahead(broken(), 10)
+    assert [next(frames).stamp_ns for _ in range(2)] == [0, 1]
+    with pytest.raises(SourceError, match="cut off"):
+        next(frames)
+
+
+def test_a_reader_ends_with_those_who_use_its_frames() -> None:
+    read: list[int] = []
+    frames = read_ahead(frames_of([100] * 50, read), 12 * 100)
+    assert next(frames).stamp_ns == 0
+    frames.close()  # type: ignore[attr-defined]  # a generator
+    assert len(read) < 10
+    assert "reader" not in [thread.name for thread in threading.enumerate()]
 
 
 @pytest.mark.fault("a drive that is longer than the memory", "no frame that was evaluated stays in memory")

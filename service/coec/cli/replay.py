@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from coec.calibration.types import Frame
     from coec.config import Config
     from coec.io.recordings.recording_source import RecordingSource
-    from coec.service.drive_replay import Difference, ReplayedDrive
+    from coec.service.decision_log import Difference, ReplayedDrive
 
 NS_PER_S = 1_000_000_000
 
@@ -113,7 +113,7 @@ def _replay_window(window: Path, depth: str | None, *, as_json: bool) -> int:
     from coec.io.mcap.windows import read_result, read_window
     from coec.io.serialise import comparable, result_of
     from coec.schemas.message import to_json
-    from coec.service.drive_replay import value_differences
+    from coec.service.decision_log import value_differences
 
     recorded = read_result(window)
     if recorded is None:
@@ -211,7 +211,7 @@ def _show_drive(
     explain_s: float | None,
     as_json: bool,
 ) -> int:
-    from coec.service.drive_replay import differences, read_log, write_log
+    from coec.service.decision_log import differences, read_log, write_log
 
     log, against, report = files
     first_ns = recording.camera_stamps_ns[0]
@@ -222,7 +222,7 @@ def _show_drive(
     if log is not None:
         write_log(log, replayed.decisions)
     if report is not None:
-        from coec.service.drive_replay import write_replay_page
+        from coec.service.decision_log import write_replay_page
 
         write_replay_page(report, recording.name, replayed, first_ns, None if against is None else differing)
     if as_json:
@@ -267,7 +267,7 @@ def _document(replayed: ReplayedDrive, differing: tuple[Difference, ...] | None)
 
 def _table(replayed: ReplayedDrive, first_ns: int) -> None:
     """Prints what was decided, without the checks that changed nothing."""
-    from coec.service.drive_replay import outline
+    from coec.service.decision_log import outline
 
     checks = [one for one in replayed.decisions if one.kind == "check"]
     windows = [one for one in replayed.decisions if one.kind == "estimate"]

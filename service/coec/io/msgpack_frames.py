@@ -41,14 +41,7 @@ def decode_camera(payload: bytes, limits: LimitsConfig) -> CameraFrame:
     Raises:
         DecodeError: not a valid message; with a reason of `Refusal`.
     """
-    wire = _read(frames.CameraFrame, payload, limits)
-    return CameraFrame(
-        stamp_ns=wire.stamp_ns,
-        frame_id=wire.frame_id,
-        image=_image(wire.image, limits),
-        sequence=wire.sequence,
-        depth=None if wire.depth is None else _depth(wire.depth, limits),
-    )
+    return _camera(_read(frames.CameraFrame, payload, limits), limits)
 
 
 def decode_lidar(payload: bytes, limits: LimitsConfig) -> LidarFrame:
@@ -81,8 +74,37 @@ def decode_ego(payload: bytes, limits: LimitsConfig) -> EgoMotion:
     Raises:
         DecodeError: not a valid message; with a reason of `Refusal`.
     """
-    wire = _read(frames.EgoMotion, payload, limits)
-    return EgoMotion(wire.stamp_ns, wire.frame_id, wire.linear_mps, wire.angular_radps, wire.sequence)
+    return _ego(_read(frames.EgoMotion, payload, limits))
+
+
+def as_decoded(frame: Frame, limits: LimitsConfig) -> Frame:
+    """The frame that would be decoded from the message of a frame, which is not packed for it.
+
+    Raises:
+        DecodeError: the message would be refused; with a reason of `Refusal`.
+    """
+    match frame:
+        case CameraFrame():
+            depth = b"" if frame.depth is None else frame.depth.data
+            if len(frame.image.data) + len(depth) + MAX_TEXT > limits.max_message_bytes:
+                return decode_camera(encode_camera(frame), limits)
+            return _camera(_wire_camera(frame), limits)
+        case LidarFrame():
+            columns = (frame.xyz_m, frame.intensity, frame.ring, frame.time_offset_s)
+            size = sum(column.nbytes for column in columns if column is not None)
+            if size + MAX_TEXT > limits.max_message_bytes or len(frame.xyz_m) > limits.max_points:
+                return decode_lidar(encode_lidar(frame), limits)
+            wire = frames.LidarFrame(
+                stamp_ns=frame.stamp_ns, frame_id=frame.frame_id, sequence=frame.sequence, points=b""
+            )
+            xyz_m, intensity, ring, time_offset_s = (
+                None if column is None else np.ascontiguousarray(column, dtype)
+                for column, dtype in zip(columns, ("<f4", "<f4", "<u2", "<f4"), strict=True)
+            )
+            assert xyz_m is not None
+            return lidar_frame(wire.stamp_ns, wire.frame_id, xyz_m, intensity, ring, time_offset_s, wire.sequence)
+        case EgoMotion():
+            return _ego(_wire_ego(frame))
 
 
 def encode(frame: Frame) -> bytes:
@@ -98,16 +120,7 @@ def encode(frame: Frame) -> bytes:
 
 def encode_camera(frame: CameraFrame) -> bytes:
     """The message that `decode_camera` reads back to an equal frame."""
-    image = frame.image
-    return to_msgpack(
-        frames.CameraFrame(
-            stamp_ns=frame.stamp_ns,
-            frame_id=frame.frame_id,
-            sequence=frame.sequence,
-            image=frames.Image(format=image.format.value, data=image.data, width=image.width, height=image.height),
-            depth=None if frame.depth is None else frames.Depth(format="png", data=frame.depth.data),
-        )
-    )
+    return to_msgpack(_wire_camera(frame))
 
 
 def encode_lidar(frame: LidarFrame) -> bytes:
@@ -129,15 +142,42 @@ def encode_lidar(frame: LidarFrame) -> bytes:
 
 def encode_ego(motion: EgoMotion) -> bytes:
     """The message that `decode_ego` reads back to an equal value."""
-    return to_msgpack(
-        frames.EgoMotion(
-            stamp_ns=motion.stamp_ns,
-            frame_id=motion.frame_id,
-            sequence=motion.sequence,
-            linear_mps=motion.linear_mps,
-            angular_radps=motion.angular_radps,
-        )
+    return to_msgpack(_wire_ego(motion))
+
+
+def _wire_camera(frame: CameraFrame) -> frames.CameraFrame:
+    image = frame.image
+    return frames.CameraFrame(
+        stamp_ns=frame.stamp_ns,
+        frame_id=frame.frame_id,
+        sequence=frame.sequence,
+        image=frames.Image(format=image.format.value, data=image.data, width=image.width, height=image.height),
+        depth=None if frame.depth is None else frames.Depth(format="png", data=frame.depth.data),
     )
+
+
+def _wire_ego(motion: EgoMotion) -> frames.EgoMotion:
+    return frames.EgoMotion(
+        stamp_ns=motion.stamp_ns,
+        frame_id=motion.frame_id,
+        sequence=motion.sequence,
+        linear_mps=motion.linear_mps,
+        angular_radps=motion.angular_radps,
+    )
+
+
+def _camera(wire: frames.CameraFrame, limits: LimitsConfig) -> CameraFrame:
+    return CameraFrame(
+        stamp_ns=wire.stamp_ns,
+        frame_id=wire.frame_id,
+        image=_image(wire.image, limits),
+        sequence=wire.sequence,
+        depth=None if wire.depth is None else _depth(wire.depth, limits),
+    )
+
+
+def _ego(wire: frames.EgoMotion) -> EgoMotion:
+    return EgoMotion(wire.stamp_ns, wire.frame_id, wire.linear_mps, wire.angular_radps, wire.sequence)
 
 
 def _read(model: type[W], payload: bytes, limits: LimitsConfig) -> W:

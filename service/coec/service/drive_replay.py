@@ -1,221 +1,50 @@
 """Replays a recorded drive through the engine of the service: which checks and windows it makes of it, what it serves,
-and when; what it decided in the order of sensor time, how two such logs differ, and both for people to read.
-
-A log is made of the records of a pair: every check, every window's estimate, every extrinsic that was served, every
-state of health. It has one JSON object a line. States that the steady clock alone brings about, such as a check that is
-overdue, have no sensor time and depend on the machine; a log leaves them out, and the return from them.
+and when.
 
 The engine is that of the service; no thread runs it. The sensor time of the frames is the clock, so no frame is dropped
 and no time passes while a job runs. A result is handed to the engine when the drive has come to the sensor time from
-which it counts, so two replays are equal to the byte whatever the machine does. Jobs run on worker processes meanwhile.
+which it counts, so two replays are equal to the byte whatever the machine does. Meanwhile jobs run on worker processes,
+and a thread reads ahead. The engine takes the frames as they were read, and checks them as if they were messages.
 """
 
 from __future__ import annotations
 
-import json
 import queue
 import re
-import shutil
+import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any, cast
+from typing import cast
 
 from coec.calibration.frames.window import SliceClosed
 from coec.calibration.types import Frame
 from coec.config import BudgetConfig, Config, PairConfig
-from coec.errors import SourceError, UsageError
+from coec.errors import SourceError
 from coec.io.disk_writer import DiskWriter
-from coec.io.msgpack_frames import encode
 from coec.io.zenoh.bus import MSGPACK, InputSample
 from coec.io.zenoh.player import stream_of
 from coec.io.zenoh.ros_node import RosTopicList
 from coec.reports.formatting import count
-from coec.reports.page import Facts, Page, Section, Table, Text, write
 from coec.schemas.keys import Keys
 from coec.service.camera_lidar_pair import CameraLidarPair
 from coec.service.cpu_budget import Budget
+from coec.service.decision_log import MOST_CHECKS, MOST_ENTRIES, ReplayedDrive, Transition, decisions_of
 from coec.service.engine import messages
 from coec.service.engine.rig import RigEstimator
 from coec.service.engine.vehicle import Vehicle
+from coec.service.ingest.pair_stream import frame_bytes
 from coec.service.process_lifetime import joined
 from coec.service.recording.recorder import RecordBetween, RecordingThread, RecordPair
 from coec.service.recording.window_store import WindowStore
-from coec.service.records.history import CheckLog, PairHistory
 from coec.service.records.pair_store import PairRecords
 from coec.service.records.state_store import StateStore
 from coec.service.timing import NS_PER_S, Clock
 from coec.service.vehicle_context import VehicleContext
 from coec.service.worker.supervisor import Worker, WorkerState
 from coec.service.worker.worker_jobs import JobOutcome, Kind, WorkerJob
-
-KINDS = ("check", "estimate", "extrinsic", "state")
-"""Of decisions, in the order in which those of one stamp are listed."""
-
-MOST_ENTRIES, MOST_CHECKS = 10_000, 100_000
-"""Entries of the history, and checks, of a log: as many as a service can keep."""
-
-MOST_BYTES = 2**28
-"""Largest log that is read."""
-
-
-@dataclass(frozen=True, slots=True)
-class Decision:
-    """One decision.
-
-    Attributes:
-        kind: one of `KINDS`.
-        stamp_ns: sensor time of the data behind it.
-        name: what it is about: id of the window, outcome of the checks, provenance of the extrinsic, state.
-        values: everything that is compared.
-    """
-
-    kind: str
-    stamp_ns: int
-    name: str
-    values: dict[str, Any]
-
-    def line(self) -> str:
-        """As a line of a log."""
-        document = {"kind": self.kind, "stamp_ns": self.stamp_ns, "name": self.name, "values": self.values}
-        return json.dumps(document, sort_keys=True, separators=(",", ":"))
-
-
-def decisions_of(records: PairRecords) -> tuple[Decision, ...]:
-    """The decisions in the records of a pair."""
-    return tuple(sorted(_decisions(records), key=lambda one: (one.stamp_ns, KINDS.index(one.kind))))
-
-
-def _decisions(records: PairRecords) -> Iterator[Decision]:
-    for check in records.checks:
-        values = check.model_dump(mode="json", exclude={"state"})
-        yield Decision("check", check.stamp_ns, check.outcome, values)
-    state = ""
-    for record in records.entries:
-        entry = record.entry
-        if entry.stamp_ns is None or (entry.kind == "state" and entry.code == state):
-            continue
-        state = entry.code if entry.kind == "state" else state
-        if record.result is not None:
-            yield Decision("estimate", entry.stamp_ns, entry.code, record.result.model_dump(mode="json"))
-        elif entry.kind in ("extrinsic", "state"):
-            pose = None if entry.camera_from_lidar is None else entry.camera_from_lidar.model_dump(mode="json")
-            values = {"code": entry.code, "window_id": entry.window_id, "camera_from_lidar": pose}
-            yield Decision(entry.kind, entry.stamp_ns, entry.code, values)
-
-
-def read_log(path: Path, pair: str) -> tuple[Decision, ...]:
-    """The decisions in a log, or in the state directory of a service.
-
-    Raises:
-        SourceError: there is no such file, or it is neither.
-    """
-    if path.is_dir():
-        return _of_state_directory(path, pair)
-    try:
-        if path.stat().st_size > MOST_BYTES:
-            raise SourceError(f"{path} is larger than {MOST_BYTES / 1e6:.0f} MB: it is no log of decisions")
-        documents = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-        return tuple(
-            Decision(str(one["kind"]), int(one["stamp_ns"]), str(one["name"]), dict(one["values"])) for one in documents
-        )
-    except OSError as error:
-        raise SourceError(f"{path} cannot be read: {error.strerror}") from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise SourceError(f"{path} is no log of decisions: write one with `coec replay DRIVE --log FILE`") from error
-
-
-def _of_state_directory(folder: Path, pair: str) -> tuple[Decision, ...]:
-    """Reads copies of the files, because damaged ones are set aside when they are opened."""
-    with TemporaryDirectory() as copies:
-        try:
-            for file in folder.glob(f"*-{pair}.jsonl"):
-                if file.stat().st_size > MOST_BYTES:
-                    raise SourceError(f"{file} is larger than {MOST_BYTES / 1e6:.0f} MB")
-                shutil.copyfile(file, Path(copies) / file.name)
-        except OSError as error:
-            raise SourceError(f"{folder} cannot be read: {error.strerror}") from error
-        history = PairHistory(Path(copies), pair, MOST_ENTRIES, {})
-        checks = CheckLog(Path(copies) / f"checks-{pair}.jsonl", MOST_CHECKS)
-        decisions = decisions_of(PairRecords(history.entries(), checks.checks(), ()))
-    if not decisions:
-        others = sorted(file.stem.removeprefix("checks-") for file in folder.glob("checks-*.jsonl"))
-        hint = f"; it has those of {', '.join(others)}: give the service's --config" if others else ""
-        raise SourceError(f"{folder} holds no records of a pair {pair}{hint}")
-    return decisions
-
-
-def write_log(path: Path, decisions: Iterable[Decision]) -> None:
-    """Writes a log.
-
-    Raises:
-        UsageError: the file cannot be written.
-    """
-    try:
-        path.write_text("".join(f"{one.line()}\n" for one in decisions), encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"{path} cannot be written: {error.strerror}") from error
-
-
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """A decision that differs. `before`, `after`: None if there is none of this kind at this sensor time. `fields`:
-    places of the values that differ."""
-
-    before: Decision | None
-    after: Decision | None
-    fields: tuple[str, ...] = ()
-
-    @property
-    def either(self) -> Decision:
-        """The decision, of whichever log has it."""
-        decision = self.after or self.before
-        assert decision is not None
-        return decision
-
-
-def differences(before: Sequence[Decision], after: Sequence[Decision]) -> tuple[Difference, ...]:
-    """What differs between two logs, in the order of sensor time. Decisions of one kind and stamp belong together."""
-    keyed_before, keyed_after = _keyed(before), _keyed(after)
-    result = []
-    for key in sorted(keyed_before.keys() | keyed_after.keys()):
-        one, other = keyed_before.get(key), keyed_after.get(key)
-        if one is None or other is None:
-            result.append(Difference(one, other))
-        elif one.values != other.values:
-            places = (place.partition("[")[0] for place, _, _ in value_differences(one.values, other.values))
-            result.append(Difference(one, other, tuple(dict.fromkeys(places))))
-    return tuple(result)
-
-
-def _keyed(decisions: Sequence[Decision]) -> dict[tuple[int, int, int], Decision]:
-    """By stamp, kind, and number among those of one stamp and kind."""
-    keyed: dict[tuple[int, int, int], Decision] = {}
-    for decision in decisions:
-        kind = KINDS.index(decision.kind) if decision.kind in KINDS else len(KINDS)
-        number = 0
-        while (decision.stamp_ns, kind, number) in keyed:
-            number += 1
-        keyed[decision.stamp_ns, kind, number] = decision
-    return keyed
-
-
-def value_differences(before: Any, after: Any, at: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """(place, before, after) of every value that differs between two documents."""
-    if isinstance(before, dict) and isinstance(after, dict):
-        for key in sorted(before.keys() | after.keys()):
-            yield from value_differences(before.get(key), after.get(key), f"{at}.{key}" if at else str(key))
-    elif isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
-        for index, (one, other) in enumerate(zip(before, after, strict=True)):
-            yield from value_differences(one, other, f"{at}[{index}]")
-    elif before != after:
-        yield at, before, after
-
-
-# --- the replay -------------------------------------------------------------------------------------------------------
 
 POLL_S = 0.02
 """Longest wait for a worker or the disk before events are looked for again, s."""
@@ -228,8 +57,55 @@ ATTEMPTS = 3
 
 STOP_S = 5.0
 
+READ_AHEAD_BYTES = 2**28
+"""Frames that may be read before the engine takes them, bytes: those of ten seconds of a LiDAR of 64 beams."""
+
 MOST_CORES = 64.0
 """Budget of a replay: what work costs does not decide what is checked."""
+
+
+def read_ahead(frames: Iterator[Frame], max_bytes: int) -> Iterator[Frame]:
+    """The same frames, read on a thread of their own while earlier ones are used. Up to `max_bytes` of them wait."""
+    condition = threading.Condition()
+    waiting: deque[Frame | Exception | None] = deque()
+    waiting_bytes, is_open = 0, True
+
+    def put(item: Frame | Exception | None) -> bool:
+        nonlocal waiting_bytes
+        size = 0 if item is None or isinstance(item, Exception) else frame_bytes(item)
+        with condition:
+            condition.wait_for(lambda: not is_open or not waiting or waiting_bytes + size <= max_bytes)
+            waiting.append(item)
+            waiting_bytes += size
+            condition.notify_all()
+            return is_open
+
+    def read() -> None:
+        try:
+            if all(put(frame) for frame in frames):
+                put(None)
+        except Exception as error:
+            put(error)
+
+    thread = threading.Thread(target=read, name="reader", daemon=True)
+    thread.start()
+    try:
+        while True:
+            with condition:
+                condition.wait_for(lambda: waiting)
+                item = waiting.popleft()
+                waiting_bytes -= 0 if item is None or isinstance(item, Exception) else frame_bytes(item)
+                condition.notify_all()
+            if item is None:
+                return
+            if isinstance(item, Exception):
+                raise item
+            yield item
+    finally:
+        with condition:
+            is_open = False
+            condition.notify_all()
+        thread.join()
 
 
 class DriveClock(Clock):
@@ -245,49 +121,6 @@ class DriveClock(Clock):
     def wall_ns(self) -> int:
         """Sensor time, ns."""
         return self.stamp_ns
-
-
-@dataclass(frozen=True, slots=True)
-class Transition:
-    """A step of the engine that did something. It is text, because the frames of its event must not stay in memory.
-
-    Attributes:
-        stamp_ns: sensor time of the drive.
-        event, actions: what came, and what it led to.
-        health: states of health before and after it.
-    """
-
-    stamp_ns: int
-    event: str
-    actions: tuple[str, ...]
-    health: tuple[str, str]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ReplayedDrive:
-    """What the engine made of a drive.
-
-    Attributes:
-        decisions: in the order of sensor time.
-        transitions: steps of the engine, in their order.
-        losses: by place and cause.
-        health: state of health at the end of the drive.
-        begin_ns, end_ns: stamps of the first and the last frame.
-        elapsed_s: time of the replay without the start of the workers, s.
-    """
-
-    decisions: tuple[Decision, ...]
-    transitions: tuple[Transition, ...]
-    losses: dict[tuple[str, str], int]
-    health: str
-    begin_ns: int
-    end_ns: int
-    elapsed_s: float
-
-    @property
-    def driven_s(self) -> float:
-        """Length of the drive, s."""
-        return (self.end_ns - self.begin_ns) / NS_PER_S
 
 
 class _ReplayVehicle(Vehicle):
@@ -401,7 +234,9 @@ class DriveReplay:
             update={"directory": folder, "history": MOST_ENTRIES, "checks": MOST_CHECKS, "min_free_bytes": 0}
         )
         log = config.log.model_copy(update={"level": "warning"})
-        config = config.model_copy(update={"state": state, "budget": BudgetConfig(cores=MOST_CORES), "log": log})
+        worker = config.worker.model_copy(update={"niceness": 0})
+        budget = BudgetConfig(cores=MOST_CORES)
+        config = config.model_copy(update={"state": state, "budget": budget, "log": log, "worker": worker})
         self._clock = DriveClock(first_ns)
         self._workers = _ReplayWorkers(config, workers)
         self._disk_writer = DiskWriter(folder)
@@ -432,11 +267,11 @@ class DriveReplay:
         begin_ns = self._clock.stamp_ns
         with self._running(), self._workers.running():
             started_s = time.monotonic()
-            for frame in frames:
+            for frame in read_ahead(frames, READ_AHEAD_BYTES):
                 self._clock.stamp_ns = max(self._clock.stamp_ns, frame.stamp_ns)
                 sensor = self._pair.sensors.get(stream_of(frame))
                 if sensor is not None:
-                    self._vehicle.inbox.put(sensor.number, InputSample(encode(frame), MSGPACK))
+                    self._vehicle.inbox.put(sensor.number, InputSample(b"", MSGPACK, frame=frame))
                 self._settle()
                 on_frame(frame.stamp_ns)
             end_ns, health = self._clock.stamp_ns, self._pair.engine.store.state.health.value
@@ -523,97 +358,3 @@ def _action_texts(actions: Sequence[messages.Action]) -> Iterator[str]:
                 yield f"check of {count(len(action.pairs), 'pair')}, counts from {action.request.due_ns} ns"
             case _:
                 yield _type_label(action)
-
-
-# --- for people -------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class OutlineLine:
-    """A decision as a line; `time` is in seconds of the drive."""
-
-    time: str
-    kind: str
-    name: str
-    text: str
-
-
-def outline(decisions: Sequence[Decision], first_ns: int) -> Iterator[OutlineLine]:
-    """The decisions of a drive that begins at `first_ns`; checks that say what the one before them said are counted."""
-    before, repeated = "", 0
-    for decision in decisions:
-        if decision.kind == "check" and decision.name == before:
-            repeated += 1
-            continue
-        if repeated:
-            yield OutlineLine("", "check", before, f"{count(repeated, 'more check')}")
-            repeated = 0
-        before = decision.name if decision.kind == "check" else before
-        seconds = f"{(decision.stamp_ns - first_ns) / NS_PER_S:.1f}"
-        yield OutlineLine(seconds, decision.kind, decision.name, _text(decision))
-    if repeated:
-        yield OutlineLine("", "check", before, f"{count(repeated, 'more check')}")
-
-
-def _text(decision: Decision) -> str:
-    values = decision.values
-    match decision.kind:
-        case "check":
-            return f"evidence {values['evidence']:.1f}, {'flagged' if values['flagged'] else 'not flagged'}"
-        case "estimate":
-            sigma = [value for value in values["sigma"][:3] if value is not None]
-            reasons = " ".join(reason["text"] for reason in values["verdict"]["reasons"])
-            text = f"{values['window_id']}, {values['pairs']} pairs"
-            return f"{text}, σ {max(sigma):.2f}°. {reasons}" if sigma else f"{text}. {reasons}"
-        case "extrinsic":
-            return "" if values["window_id"] is None else f"by {values['window_id']}"
-        case _:
-            return ""
-
-
-def write_replay_page(
-    path: Path, name: str, replayed: ReplayedDrive, first_ns: int, differing: Sequence[Difference] | None
-) -> None:
-    """Writes a page with the decisions of a drive and, if they were compared, what differs.
-
-    Raises:
-        RecordingError: the file cannot be written.
-    """
-    rows = [(line.time, line.kind, line.name, line.text) for line in outline(replayed.decisions, first_ns)]
-    sections = [
-        Section("Decisions", (Table("In the order of sensor time.", HEADS, rows, frozenset({0}), frozenset({3})),))
-    ]
-    if differing is not None:
-        sections.insert(0, Section("Differences", (_differences(differing, first_ns),)))
-    losses = tuple((f"{place}, {cause}", str(number)) for (place, cause), number in sorted(replayed.losses.items()))
-    if losses:
-        sections.append(Section("Losses", (Facts(losses),)))
-    facts = Facts(
-        (
-            ("Length of the drive", f"{replayed.driven_s:.0f} s"),
-            ("Health at the end", replayed.health),
-            ("Checks", str(sum(one.kind == "check" for one in replayed.decisions))),
-            ("Windows", str(sum(one.kind == "estimate" for one in replayed.decisions))),
-        )
-    )
-    write(path, Page("Replay of a drive", name, (facts,), tuple(sections)))
-
-
-HEADS = ("Time, s", "Decision", "Outcome", "Details")
-
-
-def _differences(differing: Sequence[Difference], first_ns: int) -> Table | Text:
-    if not differing:
-        return Text(("The decisions are equal.",))
-    rows = [
-        (
-            f"{(one.either.stamp_ns - first_ns) / NS_PER_S:.1f}",
-            one.either.kind,
-            "none" if one.before is None else one.before.name,
-            "none" if one.after is None else one.after.name,
-            ", ".join(one.fields),
-        )
-        for one in differing
-    ]
-    heads = ("Time, s", "Decision", "There", "Here", "Values that differ")
-    return Table("Decisions that differ.", heads, rows, frozenset({0}), frozenset({4}))

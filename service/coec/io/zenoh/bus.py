@@ -21,6 +21,7 @@ from typing import Any, Protocol
 import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
+from coec.calibration.types import Frame
 from coec.config import Config, LimitsConfig, StreamConfig, ZenohConfig
 from coec.errors import CoecError, UnavailableError, UsageError
 from coec.io.ros import wire_format
@@ -45,12 +46,14 @@ class InputSample:
             cannot be that. None: messages of this stream have no attachment.
         origin: id of the session that stamped the message for Zenoh: the sender's, or that of the first router on its
             way. Empty if nobody did.
+        frame: that of a recording which is replayed, in place of a message; `payload` is empty then.
     """
 
     payload: bytes
     encoding: str
     attachment: bytes | None = None
     origin: bytes = b""
+    frame: Frame | None = None
 
 
 @dataclass(frozen=True, slots=True)

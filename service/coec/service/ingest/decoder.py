@@ -338,6 +338,8 @@ class SampleReader:
         Raises:
             DecodeError: the sample holds no frame, or one of another kind.
         """
+        if sample.frame is not None:
+            return msgpack_frames.as_decoded(sample.frame, self._limits)
         configured = self._stream
         encoding, _, schema = sample.encoding.partition(";")
         if encoding not in ("application/msgpack", CDR):
