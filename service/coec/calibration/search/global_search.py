@@ -97,8 +97,9 @@ SHIFT_TURNS, SHIFT_SPAN_M = 3, 0.5
 """How often that is done at least, each time with the best poses so far that were not shifted yet; and how far it leads
 at least: the translation of the cover may be that far off, which in a room is many shifts."""
 
-SHIFT_RANKS = 60
-"""A pose that so many better ones lie apart from is not shifted."""
+SHIFT_RANKS, LEAST_SHIFTED = 60, 0.7
+"""A pose that so many better ones lie apart from is not shifted, nor one of less than this share of the highest
+significance. See docs/measured.md."""
 
 TURNED_FOR = 1.4
 """A shift to the side or upwards is also tried with the turn that leaves things at this multiple of the distance of the
@@ -155,7 +156,7 @@ def find_basins(edges: EdgeCue, start: Matrix4, reach: SearchBox) -> list[Basin]
     are_shifted = np.zeros(len(poses), np.bool_)
     for _ in range(turns):
         best = separated(poses, z, SHIFT_RANKS, ROUNDS[-1].separation_rad)
-        best = best[~are_shifted[best]][:SHIFTED_POSES]
+        best = best[~are_shifted[best] & (z[best] >= LEAST_SHIFTED * z.max())][:SHIFTED_POSES]
         if not len(best):
             break
         are_shifted[best] = True
