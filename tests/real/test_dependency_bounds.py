@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 Record = Callable[[str, object], None]
 """pytest's `record_property`."""
 
-FOLDERS = ("adapters", "cli", "fleet", "fuzz/test_corpus.py", "geometry", "library", "runtime", "schemas", "sources")
+FOLDERS = ("cli", "fleet", "fuzz/test_corpus.py", "geometry", "io", "schemas", "service")
 """Where packages of others decide: formats, messages, commands, stores, kernels; and the worker, which needs all."""
 
 LOWEST, NEWEST = ("--resolution", "lowest-direct"), ("--resolution", "highest", "--upgrade")
