@@ -107,8 +107,8 @@ class LidarEdgesConfig(ConfigModel):
         default=15.0,
         ge=0,
         le=86_400,
-        description="sensor time between two looks at the same two LiDARs, s, at least 4; one look takes about half a "
-        "second of the worker's processor time. 0: no looks. Needs the extra `lidars`, and ego-motion",
+        description="sensor time between two registrations of the same two LiDARs, s, at least 4; one takes about half "
+        "a second of the worker's processor time. 0: none. Needs the extra `lidars`, and ego-motion",
     )
 
 

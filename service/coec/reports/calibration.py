@@ -64,7 +64,7 @@ def show(
         console.show(note)
     if result.independent_looks is not None:
         console.show(
-            f"{result.pairs} pairs are worth {result.independent_looks:.1f} independent looks{_together(result)}"
+            f"{result.pairs} pairs are worth {result.independent_looks:.1f} independent samples{_together(result)}"
         )
     if result.cues is not None:
         console.show(_cues_text(result.cues))
@@ -318,7 +318,7 @@ def _search(report: CalibrationReport) -> Facts:
     )
     rows = (
         ("Pairs of image and sweep", str(report.pairs)),
-        ("Worth so many independent looks", significant(report.independent_looks)),
+        ("Worth so many independent samples", significant(report.independent_looks)),
         ("Points in view", significant(float(report.points_in_view), 9)),
         ("Overlap", percent(report.overlap)),
         ("Motion compensation, pairs", compensation or "–"),

@@ -21,7 +21,7 @@ def board(fleet: FleetNow, selected: int, first: int, rows: int, filtered: str) 
     """The head, and `rows` of the pairs from `first` on; the one at `chosen` is marked (-1: none)."""
     shown = fleet.pairs[first : first + rows]
     table = console.table(
-        "", "vehicle", "pair", "state", "said", "looked", "drift", "± σ", "why", "event", right=(4, 5, 6, 7)
+        "", "vehicle", "pair", "state", "said", "checked", "drift", "± σ", "why", "event", right=(4, 5, 6, 7)
     )
     for index, pair in enumerate(shown, first):
         table.add_row(*_row(pair, marked=index == selected), style="reverse" if index == selected else "")

@@ -46,7 +46,7 @@ def status(payload: bytes) -> None:
     if reply.budget is not None:
         _budget(reply.budget)
     table = console.table(
-        "pair", "looked, s ago", "", "checks", "camera", "lidar", "ego", "pairs", "chosen", "windows", "solved",
+        "pair", "checked, s ago", "", "checks", "camera", "lidar", "ego", "pairs", "chosen", "windows", "solved",
         right=(1, *range(3, 11)),
     )  # fmt: skip
     for pair in reply.pairs:
@@ -324,7 +324,7 @@ def rig(payload: bytes) -> None:
 def _lidars(reply: rig_state.RigReply) -> None:
     """Prints where LiDARs sit relative to each other, and the age of that in sensor time."""
     table = console.table(
-        "LiDARs", "state", "age, s", "looks", *(f"{name} ± σ" for name in console.AXES), right=range(2, 10)
+        "LiDARs", "state", "age, s", "registrations", *(f"{name} ± σ" for name in console.AXES), right=range(2, 10)
     )
     for lidars in reply.lidars:
         age = "-"
