@@ -297,3 +297,12 @@ def test_no_mutation_ends_otherwise_than_in_an_error_of_ours(
     path.write_bytes(data.draw(mutations(whole)))
     with suppress(CoecError):
         read(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"rubbish" * 99])
+@pytest.mark.parametrize("suffix", ["mcap", "db3", "bag"])
+def test_a_file_that_is_no_bag_is_not_called_a_damaged_one(tmp_path: Path, suffix: str, content: bytes) -> None:
+    path = tmp_path / f"drive.{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(SourceError, match=r"drive\.\w+ is no (bag|MCAP file)"):
+        open_source(str(path))

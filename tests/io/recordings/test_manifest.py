@@ -385,3 +385,12 @@ def test_compensated_clouds_are_recognised_by_their_turn(tmp_path: Path) -> None
         assert codes == []
         assert np.ptp(given_s) > 0.09
     assert times_s(compensated="middle")[1] == pytest.approx(0.05, abs=0.001)
+
+
+def test_an_empty_folder_and_the_configuration_of_a_service_are_named(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"has neither a dataset\.yaml nor files of a bag"):
+        open_source(str(tmp_path))
+    path = tmp_path / "coec.yaml"
+    path.write_text("vehicle: shuttle\npairs: []\n")
+    with pytest.raises(SourceError, match=r"is the configuration of a service .*, not a dataset\.yaml"):
+        open_source(str(path))

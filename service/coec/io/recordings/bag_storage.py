@@ -285,6 +285,8 @@ class SqliteStorage:
                     raise SourceError(f"{self.path} is no bag: it has no tables {' and '.join(sorted(_TABLES))}")
                 yield connection
         except sqlite3.Error as error:
+            if getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_NOTADB:
+                raise SourceError(f"{self.path} is no bag: it is no database of SQLite") from error
             raise SourceError(f"{self.path} is damaged: {error}. `ros2 bag reindex` may save it") from error
 
 
@@ -430,7 +432,7 @@ def _connection(record: _Record) -> tuple[str, int | None]:
 def _of_file(stream: BinaryIO) -> Iterator[tuple[_Record, int]]:
     """The records of a file, each with the byte at which it begins."""
     if stream.read(len(MAGIC)) != MAGIC:
-        raise ValueError("byte 0: it does not begin as a bag of ROS 1 (version 2.0) does")
+        raise SourceError(f"{stream.name} is no bag of ROS 1 (version 2.0): byte 0: it does not begin as one does")
     begin = stream.tell()
     while (record := _next(stream)) is not None:
         yield record, begin

@@ -136,7 +136,10 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
     path = spec.path / FILE_NAME if spec.path.is_dir() else spec.path
     if not path.is_file():
         layouts = "kitti360:..., kitti-raw:... or kitti-odometry:..."
-        raise SourceError(f"{spec.path} has no {FILE_NAME}; for a KITTI folder write {layouts}")
+        raise SourceError(
+            f"{spec.path} has neither a {FILE_NAME} nor files of a bag (.mcap, .db3, .bag); for a KITTI folder write "
+            f"{layouts}"
+        )
     document, camera, mask = _read(path)
     T_camera_lidar = np.array(document.T_camera_lidar, dtype=np.float64)
     T_cloud_lidar = np.array(document.T_cloud_lidar, dtype=np.float64)
@@ -191,6 +194,8 @@ def _read(path: Path) -> tuple[ManifestDocument, Camera, NDArray[np.bool_] | Non
             f"{path} holds the intrinsics of a camera, not a list of frames: name it as `camera: {path.name}` "
             f"in a {FILE_NAME}, or behind a bag as BAG?intrinsics={path.name}"
         )
+    if isinstance(text, dict) and "pairs" in text and "frames" not in text:
+        raise SourceError(f"{path} is the configuration of a service (`coec run --config`), not a {FILE_NAME}")
     try:
         document = ManifestDocument.model_validate(with_camera(text, path))
         camera = camera_of(document.camera)
