@@ -107,7 +107,7 @@ def test_a_manifest_takes_no_query(tmp_path: Path) -> None:
 def test_paths_that_lead_nowhere(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="does not exist"):
         open_source(str(tmp_path / "absent.mcap"))
-    with pytest.raises(SourceError, match=r"has no dataset\.yaml"):
+    with pytest.raises(SourceError, match=r"has neither a dataset\.yaml"):
         open_source(str(tmp_path))
     (tmp_path / "file.txt").write_text("x")
     with pytest.raises(UsageError, match="neither a folder nor"):

@@ -288,7 +288,6 @@ def test_a_type_that_is_not_read_is_refused() -> None:
 @pytest.mark.parametrize(
     ("type_name", "advice"),
     [
-        ("point_cloud_interfaces/msg/CompressedPointCloud2", "republish"),
         ("ffmpeg_image_transport_msgs/msg/FFMPEGPacket", "JPEG"),
         ("ouster_sensor_msgs/msg/PacketMsg", "PointCloud2.*replay.launch"),
         ("hesai_ros_driver/msg/UdpFrame", "source_type: 3"),

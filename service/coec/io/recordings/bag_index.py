@@ -24,7 +24,7 @@ from coec.calibration.types import EgoMotion, Frame, Matrix4, Recognition
 from coec.config import LimitsConfig, PointTimeConfig, describe
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.io.recordings.bag_storage import MAX_MESSAGE_BYTES, BagMessage, BagReader, BagStorage
-from coec.io.ros import camera_info, message_decoding, messages, point_clouds
+from coec.io.ros import camera_info, message_decoding, messages, packed_clouds, point_clouds
 from coec.io.ros import transforms as ros_transforms
 from coec.io.video import VideoTrack, codec_of
 from coec.schemas.keys import TF_STATIC
@@ -74,7 +74,8 @@ class CloudDecoder:
 
 VIDEO_TYPES = (messages.FFMPEG_PACKET, messages.COMPRESSED_VIDEO)
 IMAGE_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE, *VIDEO_TYPES)
-CLOUD_TYPES = (messages.POINT_CLOUD, *point_clouds.TYPES, messages.VELODYNE_SCAN)
+POINT_TYPES = (messages.POINT_CLOUD, *point_clouds.TYPES)
+CLOUD_TYPES = (*POINT_TYPES, *packed_clouds.TYPES)
 VELOCITY_TYPES = (messages.ODOMETRY, messages.TWIST, messages.TWIST_WITH_COVARIANCE)
 ROTATION_TYPES = (messages.IMU,)
 
@@ -158,7 +159,7 @@ class BagIndex:
         topic = self.optional_topic(types, requested, key)
         if topic is None:
             advice = "".join(f"; {other} has {text}" for other, text in self.unread.items())
-            others = (*point_clouds.TYPES, *VIDEO_TYPES, messages.VELODYNE_SCAN)
+            others = (*point_clouds.TYPES, *VIDEO_TYPES, *packed_clouds.TYPES)
             named = " or ".join(name for name in types if name not in others)
             raise SourceError(f"{self.path} has no message of type {named}{advice}")
         return topic
@@ -201,12 +202,13 @@ class BagIndex:
         return topic
 
     def lidar_topic(self, requested: str | None) -> str:
-        """The topic of clouds that was asked for, else the only one of points, else the only one of packets.
+        """The topic of clouds that was asked for, else the only one of points, else the only one of packed clouds or
+        packets.
 
         Raises:
             SourceError: as `topic`.
         """
-        of_points = [topic for topic, one in self.streams.items() if one.type_name in CLOUD_TYPES[:-1]]
+        of_points = [topic for topic, one in self.streams.items() if one.type_name in POINT_TYPES]
         return self.topic(CLOUD_TYPES, of_points[0] if not requested and len(of_points) == 1 else requested, "points")
 
     def transform(self, target: str, source: str) -> Matrix4 | None:

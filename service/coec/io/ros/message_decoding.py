@@ -2,17 +2,12 @@
 forms that frames do not have are converted without loss of what is used: NV12 and NV21 to YUV 4:2:2, colours of 16
 bits to eight, WebP and TIFF to raw pixels.
 
-Scans of Velodyne's packets (`velodyne_msgs/VelodyneScan`) are decoded to clouds by `velodyne-decoder`, the library of
-the optional extra `velodyne`, which recognises the model and has the calibration of most; points are in the axes and
-rings in the order of ROS's driver.
-
 Every length in a message is only a claim of the sender, so that it is checked before a decoder builds anything from
 it.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import struct
 from collections.abc import Callable
@@ -31,7 +26,7 @@ from coec.errors import DecodeError
 from coec.io import images
 from coec.io.frame_validation import MAX_SPEED, Refusal, check_size
 from coec.io.images import BYTES_PER_PIXEL, eight_bits, probe, raw_image
-from coec.io.ros import messages, point_clouds
+from coec.io.ros import messages, packed_clouds, point_clouds
 from coec.io.ros.messages import check_cloud_fields, check_header, deserialized, frame_id, stamp_ns
 
 SEMIPLANAR: Final = {"nv12": (0, 1), "nv21": (1, 0)}
@@ -328,11 +323,7 @@ _VIDEO: Final = (
     "packets of video are no pictures (H.264 and H.265 are read from recordings): take the camera's topic of JPEG "
     "(image_transport) or of raw pixels, or unpack them with `ros2 run image_transport republish`"
 )
-_PACKED: Final = (
-    "clouds packed by point_cloud_transport (Draco, Cloudini, zlib) are not read: unpack them with `ros2 run "
-    "point_cloud_transport republish` (of a file packed by Cloudini, `cloudini_rosbag_converter -d`), and take the "
-    "topic of PointCloud2"
-)
+_PACKED: Final = f"packed clouds are read from recordings only: {packed_clouds.UNPACK}"
 _PACKETS: Final = (
     "packets of the LiDAR are no points: take the topic of PointCloud2 of its driver, or convert them with "
 )
@@ -342,7 +333,7 @@ _HESAI: Final = f"{_PACKETS}hesai_ros_driver, `source_type: 3` in its config.yam
 REFUSED: Final = {
     messages.FFMPEG_PACKET: _VIDEO,
     messages.COMPRESSED_VIDEO: _VIDEO,
-    "foxglove_msgs/msg/CompressedPointCloud": _PACKED,
+    messages.FOXGLOVE_CLOUD: _PACKED,
     "theora_image_transport/msg/Packet": _VIDEO,
     messages.VELODYNE_SCAN: f"{_PACKETS}velodyne_pointcloud (velodyne_transform_node)",
     "ouster_sensor_msgs/msg/PacketMsg": _OUSTER,
@@ -351,7 +342,7 @@ REFUSED: Final = {
     "hesai_ros_driver/msg/UdpFrame": _HESAI,
     "pandar_msgs/msg/PandarScan": f"{_PACKETS}the driver of Hesai or nebula_ros",
     "rslidar_msg/msg/RslidarPacket": f"{_PACKETS}rslidar_sdk, `msg_source: 2` in its config.yaml (packets from ROS)",
-    "point_cloud_interfaces/msg/CompressedPointCloud2": _PACKED,
+    messages.COMPRESSED_CLOUD: _PACKED,
     "sensor_msgs/msg/PointCloud": "PointCloud has been replaced by PointCloud2: convert it (point_cloud_converter)",
     messages.TF: "a transform tells where a frame is, not what it sees; it counts as motion if `ego.type` is this one",
 }
@@ -387,8 +378,8 @@ def decode(
             check_cloud_fields(payload)
             message = deserialized(ros.sensor_msgs__msg__PointCloud2, payload)
             return _point_cloud(message, limits, point_time, source)
-        case messages.VELODYNE_SCAN:
-            return _point_cloud(cloud_of_scan(payload), limits, point_time, source)
+        case _ if type_name in packed_clouds.TYPES:
+            return _point_cloud(packed_clouds.cloud_of(type_name, payload, limits), limits, point_time, source)
         case _ if type_name in point_clouds.TYPES:
             return _point_cloud(point_clouds.cloud_of_cdr(payload), limits, point_time, source)
         case _:
@@ -443,47 +434,3 @@ def _point_cloud(
 ) -> LidarFrame:
     frame_id(message.header.frame_id)
     return point_clouds.frame_of(message, stamp_ns(message.header), limits, point_time=point_time, source=source)
-
-
-MAX_PACKETS = 4096
-"""Most packets of a scan; a turn of the largest model at 5 Hz has some 2,500."""
-
-_FIELDS = (("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 12, 7), ("time", 16, 7), ("ring", 22, 2))
-"""Name, offset and `PointField.datatype` of what is read of the library's points."""
-
-WITHOUT_EXTRA = (
-    "packets of Velodyne are decoded with the optional extra `velodyne`: pip install 'coec[velodyne]'; or convert them "
-    "with velodyne_pointcloud's velodyne_transform_node, and take its topic of PointCloud2"
-)
-
-
-def cloud_of_scan(payload: bytes) -> ros.sensor_msgs__msg__PointCloud2:
-    """The cloud of a message in CDR, its points timed since its stamp.
-
-    Raises:
-        DecodeError: `message_malformed`, `frame_id_invalid`; `message_type`: the optional extra is not installed.
-    """
-    count = messages.check_header(payload).number()
-    if not 0 < count <= MAX_PACKETS:
-        raise DecodeError(Refusal.MESSAGE_MALFORMED, f"{count} packets; a scan has up to {MAX_PACKETS}")
-    if importlib.util.find_spec("velodyne_decoder") is None:
-        raise DecodeError(Refusal.MESSAGE_TYPE, WITHOUT_EXTRA)
-    import velodyne_decoder as velodyne
-
-    message = messages.deserialized_by_name(messages.VELODYNE_SCAN, payload)
-    packets = [
-        velodyne.VelodynePacket(each.stamp.sec + each.stamp.nanosec * 1e-9, each.data.tobytes())
-        for each in message.packets
-    ]
-    try:
-        stamps, points = velodyne.ScanDecoder(velodyne.Config()).decode(velodyne.PacketVector(packets), True)
-    except (RuntimeError, ValueError, IndexError) as error:
-        raise DecodeError(Refusal.MESSAGE_MALFORMED, f"the packets of Velodyne are not read: {error}") from error
-    # The library counts from the last packet, the message is stamped by its first or last one.
-    stamp = message.header.stamp
-    points["time"] += np.float32(stamps.host - (stamp.sec + stamp.nanosec * 1e-9))
-    fields = [ros.sensor_msgs__msg__PointField(name, offset, kind, 1) for name, offset, kind in _FIELDS]
-    step, data = points.dtype.itemsize, np.frombuffer(points.tobytes(), np.uint8)
-    return ros.sensor_msgs__msg__PointCloud2(
-        message.header, 1, len(points), fields, False, step, step * len(points), data, True
-    )

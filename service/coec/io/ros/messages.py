@@ -27,12 +27,18 @@ DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
 FFMPEG_PACKET: Final = "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
 COMPRESSED_VIDEO: Final = "foxglove_msgs/msg/CompressedVideo"
 VELODYNE_SCAN: Final = "velodyne_msgs/msg/VelodyneScan"
+COMPRESSED_CLOUD: Final = "point_cloud_interfaces/msg/CompressedPointCloud2"
+FOXGLOVE_CLOUD: Final = "foxglove_msgs/msg/CompressedPointCloud"
 
 _DEFINITIONS: Final = {
     FFMPEG_PACKET: "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\nuint64 pts\nuint8 flags\n"
     "bool is_bigendian\nuint8[] data\n",
     "velodyne_msgs/msg/VelodynePacket": "builtin_interfaces/Time stamp\nuint8[1206] data\n",
     VELODYNE_SCAN: "std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets\n",
+    COMPRESSED_CLOUD: "std_msgs/Header header\nuint32 height\nuint32 width\nsensor_msgs/PointField[] fields\n"
+    "bool is_bigendian\nuint32 point_step\nuint32 row_step\nuint8[] compressed_data\nbool is_dense\nstring format\n",
+    FOXGLOVE_CLOUD: "builtin_interfaces/Time timestamp\nstring frame_id\ngeometry_msgs/Pose pose\nuint8[] data\n"
+    "string format\n",
     COMPRESSED_VIDEO: "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n",
 }
 """Of types that are not ROS's own."""
@@ -63,6 +69,11 @@ def deserialized(message_type: type[T], payload: bytes) -> T:
     if not isinstance(message, message_type):
         raise TypeError(f"the type store made {type(message)} of {message_type}")
     return message
+
+
+def message_class(type_name: str) -> Any:
+    """The class of a type by its name, which may be one of `OTHER_TYPES`."""
+    return _STORE.types[type_name]
 
 
 def deserialized_by_name(type_name: str, payload: bytes) -> Any:
@@ -193,7 +204,7 @@ def header_frame_id(payload: bytes) -> str:
 
 
 def check_cloud_fields(payload: bytes) -> None:
-    """Checks the fields of a `PointCloud2`.
+    """Checks the fields of a `PointCloud2`, or of a packed one.
 
     Raises:
         DecodeError: `cloud_fields`, `frame_id_invalid` or `message_malformed`.

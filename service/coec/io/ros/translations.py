@@ -1,5 +1,5 @@
 """Messages in other encodings as ROS 2 messages in CDR: those of ROS 1, and Foxglove's schemas in protobuf and JSON
-(images, video, clouds, calibrations, transforms). Recordings of these read like ROS 2 bags.
+(images, video, clouds, calibrations, transforms, odometry). Recordings of these read like ROS 2 bags.
 
 Protobuf is read by a few lines that know the wire format (protobuf.dev, "Encoding"), so that no library builds anything
 from the lengths in a message; each length is checked against what is left. Foxglove's numbers of fields are those of
@@ -163,6 +163,7 @@ def _message(**fields: Any) -> Fields:
 _TIMESTAMP: Final = _message(sec="number", nsec="number")
 _VECTOR: Final = _message(x="double", y="double", z="double")
 _QUATERNION: Final = _message(x="double", y="double", z="double", w="double")
+_POSE: Final = _message(position=_VECTOR, orientation=_QUATERNION)
 _TRANSFORM: Final = _message(
     timestamp=_TIMESTAMP, parent_frame_id="text", child_frame_id="text", translation=_VECTOR, rotation=_QUATERNION
 )
@@ -174,10 +175,19 @@ _RAW_IMAGE: Final = _message(
 _POINT_CLOUD: Final = _message(
     timestamp=_TIMESTAMP,
     frame_id="text",
-    pose=_message(position=_VECTOR, orientation=_QUATERNION),
+    pose=_POSE,
     point_stride="number",
     fields=[_message(name="text", offset="number", type="number")],
     data="bytes",
+)
+_PACKED_CLOUD: Final = _message(timestamp=_TIMESTAMP, frame_id="text", pose=_POSE, data="bytes", format="text")
+_ODOMETRY: Final = _message(
+    timestamp=_TIMESTAMP,
+    frame_id="text",
+    body_frame_id="text",
+    pose=_POSE,
+    linear_velocity=_VECTOR,
+    angular_velocity=_VECTOR,
 )
 _CALIBRATION: Final = _message(
     timestamp=_TIMESTAMP,
@@ -234,6 +244,32 @@ def _point_cloud(values: Mapping[str, Any]) -> Any:
     return ros.sensor_msgs__msg__PointCloud2(_header(values), 1, width, fields, False, step, width * step, data, True)
 
 
+def _packed_cloud(values: Mapping[str, Any]) -> Any:
+    head, pose, form = _header(values), _pose(values.get("pose") or {}), str(values.get("format", ""))
+    return messages.message_class(messages.FOXGLOVE_CLOUD)(head.stamp, head.frame_id, pose, _bytes_of(values), form)
+
+
+def _odometry(values: Mapping[str, Any]) -> Any:
+    linear, angular = (_vector(values.get(f"{which}_velocity") or {}) for which in ("linear", "angular"))
+    pose = ros.geometry_msgs__msg__PoseWithCovariance(_pose(values.get("pose") or {}), np.zeros(36))
+    twist = ros.geometry_msgs__msg__TwistWithCovariance(ros.geometry_msgs__msg__Twist(linear, angular), np.zeros(36))
+    return ros.nav_msgs__msg__Odometry(_header(values), str(values.get("body_frame_id", "")), pose, twist)
+
+
+def _vector(values: Mapping[str, Any]) -> Any:
+    return ros.geometry_msgs__msg__Vector3(*(float(values.get(axis, 0.0)) for axis in "xyz"))
+
+
+def _rotation(values: Mapping[str, Any]) -> Any:
+    return ros.geometry_msgs__msg__Quaternion(*(float(values.get(axis, 0.0)) for axis in "xyzw"))
+
+
+def _pose(values: Mapping[str, Any]) -> Any:
+    place = _vector(values.get("position") or {})
+    point = ros.geometry_msgs__msg__Point(place.x, place.y, place.z)
+    return ros.geometry_msgs__msg__Pose(point, _rotation(values.get("orientation") or {}))
+
+
 def _calibration(values: Mapping[str, Any]) -> Any:
     k, r, p = (_doubles(values, name, count) for name, count in (("K", 9), ("R", 9), ("P", 12)))
     d, region = _doubles(values, "D", None), ros.sensor_msgs__msg__RegionOfInterest(0, 0, 0, 0, False)
@@ -247,10 +283,8 @@ def _transforms(values: Mapping[str, Any]) -> Any:
 
 
 def _transform(values: Mapping[str, Any]) -> Any:
-    place, turn = values.get("translation") or {}, values.get("rotation") or {}
-    vector = ros.geometry_msgs__msg__Vector3(*(float(place.get(axis, 0.0)) for axis in "xyz"))
-    rotation = ros.geometry_msgs__msg__Quaternion(*(float(turn.get(axis, 0.0)) for axis in "xyzw"))
     header = _header({**values, "frame_id": values.get("parent_frame_id", "")})
+    vector, rotation = _vector(values.get("translation") or {}), _rotation(values.get("rotation") or {})
     pose = ros.geometry_msgs__msg__Transform(vector, rotation)
     return ros.geometry_msgs__msg__TransformStamped(header, str(values.get("child_frame_id", "")), pose)
 
@@ -274,6 +308,8 @@ _FOXGLOVE: Final[Mapping[str, tuple[str, Fields, Callable[[Mapping[str, Any]], A
     "foxglove.CompressedVideo": (messages.COMPRESSED_IMAGE, _COMPRESSED_VIDEO, _compressed_image),
     "foxglove.RawImage": (messages.IMAGE, _RAW_IMAGE, _raw_image),
     "foxglove.PointCloud": (messages.POINT_CLOUD, _POINT_CLOUD, _point_cloud),
+    "foxglove.CompressedPointCloud": (messages.FOXGLOVE_CLOUD, _PACKED_CLOUD, _packed_cloud),
+    "foxglove.Odometry": (messages.ODOMETRY, _ODOMETRY, _odometry),
     "foxglove.CameraCalibration": (messages.CAMERA_INFO, _CALIBRATION, _calibration),
     "foxglove.FrameTransforms": (messages.TF, _message(transforms=[_TRANSFORM]), _transforms),
     "foxglove.FrameTransform": (messages.TF, _TRANSFORM, lambda values: _transforms({"transforms": [values]})),

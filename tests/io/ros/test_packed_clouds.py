@@ -1,0 +1,240 @@
+"""Packed clouds in messages: of point_cloud_transport (Draco, Cloudini, zlib, zstd) and for Foxglove (Draco). Each is
+packed by the library that packs such clouds."""
+
+from __future__ import annotations
+
+import importlib.util
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.writer import Writer
+from numpy.typing import NDArray
+
+from coec.calibration.types import LidarFrame
+from coec.config import LimitsConfig
+from coec.errors import DecodeError, SourceError
+from coec.io.recordings.layouts import open_source
+from coec.io.ros import messages
+from coec.io.ros.message_decoding import decode
+from support.recordings import Bag, drive_messages
+from support.ros import STAMP_NS, Packer
+
+LIMITS = LimitsConfig()
+COUNT = 500
+
+POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2"), ("t", "<u4")])
+"""Without padding: 22 bytes."""
+
+FIELDS = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 12, 7), ("ring", 16, 4), ("t", 18, 6)]
+
+
+def points() -> NDArray[Any]:
+    rng, rows = np.random.default_rng(0), np.zeros(COUNT, POINT)
+    for axis in "xyz":
+        rows[axis] = rng.uniform(-40.0, 40.0, COUNT)
+    rows["intensity"], rows["ring"] = rng.integers(0, 255, COUNT), np.arange(COUNT) % 16
+    rows["t"] = np.arange(COUNT) * 200_000
+    return rows
+
+
+def message(
+    form: str, packed: bytes, *, width: int = COUNT, height: int = 1, step: int = POINT.itemsize, fields: Any = FIELDS
+) -> bytes:
+    """`point_cloud_interfaces/CompressedPointCloud2` in CDR."""
+    packer = Packer().header("lidar").put("I", height, width, len(fields))
+    for name, offset, datatype in fields:
+        packer.text(name).put("I", offset).put("B", datatype).put("I", 1)
+    packer.put("?", False).put("I", step, width * step % 2**32).octets(packed).put("?", True)
+    return packer.text(form).done()
+
+
+def of_zlib(rows: NDArray[Any]) -> bytes:
+    return zlib.compress(rows.tobytes())
+
+
+def of_zstd(rows: NDArray[Any]) -> bytes:
+    return zstandard.compress(rows.tobytes())
+
+
+def of_cloudini(rows: NDArray[Any], **options: Any) -> bytes:
+    pureini = pytest.importorskip("pureini", reason="needs the extra cloudini")
+    fields = [pureini.PointField(name, offset, pureini.FieldType(kind)) for name, offset, kind in FIELDS]
+    info = pureini.EncodingInfo(
+        fields,
+        width=len(rows),
+        point_step=POINT.itemsize,
+        encoding_opt=pureini.EncodingOptions.LOSSLESS,
+        compression_opt=pureini.CompressionOption.ZSTD,
+        **options,
+    )
+    return bytes(pureini.PointcloudEncoder(info).encode(rows.tobytes()))
+
+
+def of_draco(rows: NDArray[Any], *, kd_tree: bool = False) -> bytes:
+    """One attribute of three components for the position; the others in the order of the fields, with their names."""
+    draco = pytest.importorskip("DracoPy", reason="needs the extra draco")
+    xyz = np.stack([rows[axis] for axis in "xyz"], axis=1)
+    others = {name: rows[name].astype(np.uint32)[:, None] for name in ("ring", "t")}
+    others["intensity"] = rows["intensity"][:, None]
+    return bytes(
+        draco.encode(
+            xyz,
+            quantization_bits=20,
+            preserve_order=not kd_tree,
+            create_metadata=True,
+            generic_attributes={name: others[name] for name in ("intensity", "ring", "t")},
+        )
+    )
+
+
+def sweep_of(payload: bytes, type_name: str = messages.COMPRESSED_CLOUD) -> LidarFrame:
+    frame = decode(type_name, payload, LIMITS)
+    assert isinstance(frame, LidarFrame)
+    return frame
+
+
+def require_points(sweep: LidarFrame, rows: NDArray[Any], tolerance_m: float = 0.0) -> None:
+    assert (sweep.stamp_ns, sweep.frame_id) == (STAMP_NS, "lidar")
+    expected = np.stack([rows[axis] for axis in "xyz"], axis=1)
+    np.testing.assert_allclose(sweep.xyz_m, expected, atol=tolerance_m, rtol=0.0)
+    assert sweep.ring is not None
+    assert sweep.intensity is not None
+    assert sweep.time_offset_s is not None
+    np.testing.assert_array_equal(sweep.ring, rows["ring"])
+    np.testing.assert_array_equal(sweep.intensity, rows["intensity"])
+    np.testing.assert_allclose(sweep.time_offset_s, rows["t"] * 1e-9, atol=1e-7)
+
+
+@pytest.mark.parametrize(("form", "pack"), [("zlib", of_zlib), ("zstd", of_zstd), ("cloudini", of_cloudini)])
+def test_a_lossless_form_gives_the_same_points(form: str, pack: Callable[[NDArray[Any]], bytes]) -> None:
+    require_points(sweep_of(message(form, pack(points()))), points())
+
+
+@pytest.mark.parametrize("version", [2, 3, 4, 5])
+def test_each_version_of_cloudini(version: int) -> None:
+    require_points(sweep_of(message("cloudini", of_cloudini(points(), version=version))), points())
+
+
+def test_draco_gives_the_points_to_its_quantisation() -> None:
+    require_points(sweep_of(message("draco", of_draco(points()))), points(), 80.0 / 2**20)
+
+
+def test_draco_in_an_order_of_its_own_keeps_the_columns_together() -> None:
+    sweep, rows = sweep_of(message("draco", of_draco(points(), kd_tree=True))), points()
+    assert sweep.ring is not None
+    at = np.argmin(np.linalg.norm(sweep.xyz_m[:, None] - np.stack([rows[a] for a in "xyz"], 1)[None], axis=2), axis=1)
+    assert len(np.unique(at)) == COUNT
+    np.testing.assert_array_equal(sweep.ring, rows["ring"][at])
+
+
+def test_foxgloves_form_of_draco() -> None:
+    packed = of_draco(points())
+    for place in ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)):
+        packer = Packer().header("lidar").put("d", *place, 0.0, 0.0, 0.0, 1.0).octets(packed).text("draco")
+        if any(place):
+            with pytest.raises(DecodeError, match="has a pose in its frame"):
+                sweep_of(packer.done(), messages.FOXGLOVE_CLOUD)
+        else:
+            require_points(sweep_of(packer.done(), messages.FOXGLOVE_CLOUD), points(), 80.0 / 2**20)
+
+
+def draco_bytes(place: int, value: bytes) -> bytes:
+    packed = bytearray(of_draco(points()))
+    packed[place : place + len(value)] = value
+    return bytes(packed)
+
+
+@pytest.mark.parametrize(
+    ("payload", "cause"),
+    [
+        (lambda: message("zlib", b"abc"), "not packed by zlib"),
+        (lambda: message("zlib", of_zlib(points())[:-40]), "fit|cut|bytes"),
+        (lambda: message("zlib", zlib.compress(bytes(10**7)), width=0), "no point|has no|empty"),
+        (lambda: message("zlib", of_zlib(points()), width=2**31), "would unpack to 47244640256 bytes"),
+        (lambda: message("zstd", b"abc"), "not packed by zstd"),
+        (lambda: message("zstd", zstandard.compress(bytes(10**7))), "more than its 11000 bytes"),
+        (lambda: message("lz4", b"abc"), "of the format 'lz4': draco, zlib, zstd, cloudini are read"),
+        (lambda: message("cloudini", b"CLOUDINI_V03\nwidth: 1\n"), "not packed by Cloudini"),
+        (lambda: message("cloudini", of_cloudini(points()), width=10), "more than its 220 bytes"),
+        (lambda: message("cloudini", of_cloudini(points())[:-50]), "by Cloudini is damaged"),
+        (lambda: message("draco", b"DRACO\2\3\1\0\0\0abc"), "it is a mesh"),
+        (lambda: message("draco", of_draco(points())[:30]), "cut off"),
+        (lambda: message("draco", of_draco(points())[:300]), "by Draco is damaged"),
+        (lambda: message("draco", of_draco(points()), width=400), "has 500 points; its message allows 400"),
+        (lambda: message("draco", of_draco(points()), fields=[*FIELDS[:-1], ("t", 20, 6)]), "outside of the 22 bytes"),
+        (lambda: message("draco", of_draco(points()), fields=[*FIELDS, ("u", 18, 6)]), "points and fields"),
+    ],
+)
+def test_what_is_no_packed_cloud_is_refused(payload: Callable[[], bytes], cause: str) -> None:
+    with pytest.raises(DecodeError, match=cause):
+        sweep_of(payload())
+
+
+@pytest.mark.fault("a cloud packed by Draco that promises billions of points", "nothing is allocated for it")
+def test_a_draco_cloud_that_promises_more_than_its_message_is_refused() -> None:
+    pytest.importorskip("DracoPy", reason="needs the extra draco")
+    head = b"DRACO" + struct.pack("<BBBBH", 2, 3, 0, 0, 0)
+    for body in (struct.pack("<IBB", 2**32 - 1, 1, 1), struct.pack("<IB", COUNT, 1) + b"\xff\xff\xff\xff\x0f"):
+        with pytest.raises(DecodeError, match=r"its message allows|more attributes"):
+            sweep_of(message("draco", head + body + b"\0\x09\xff\0\0" * 3))
+
+
+@given(st.integers(0, 400), st.binary(min_size=1, max_size=8), st.sampled_from(["draco", "cloudini", "zlib", "zstd"]))
+def test_damaged_bytes_raise_nothing_else(place: int, value: bytes, form: str) -> None:
+    packed = bytearray({"draco": of_draco, "cloudini": of_cloudini, "zlib": of_zlib, "zstd": of_zstd}[form](points()))
+    packed[place : place + len(value)] = value
+    try:
+        sweep_of(message(form, bytes(packed)))
+    except DecodeError:
+        return
+
+
+def bag_of_packed(folder: Path, form: str, pack: Callable[[NDArray[Any]], bytes]) -> str:
+    """The drive, its clouds packed."""
+    folder.mkdir()
+    drive = drive_messages()
+    Bag([(topic, one) for topic, one in drive if topic != "/points"]).write(folder / "drive.mcap")
+    with (folder / "packed.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema(messages.COMPRESSED_CLOUD, "ros2msg", b"")
+        channel = writer.register_channel("/points/packed", "cdr", schema)
+        for time, (topic, one) in enumerate(drive):
+            if topic == "/points":
+                rows = np.frombuffer(one.data.tobytes(), np.dtype((np.void, one.point_step)))
+                fields = [(field.name, field.offset, field.datatype) for field in one.fields]
+                packer = message(form, pack(rows), width=one.width, step=one.point_step, fields=fields)
+                head = Packer().header(one.header.frame_id, one.header.stamp.sec, one.header.stamp.nanosec).done()
+                body = packer[len(Packer().header("lidar").done()) :]
+                writer.add_message(channel, time, head + body, time)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return str(folder)
+
+
+@pytest.mark.parametrize(("form", "pack"), [("zlib", of_zlib), ("zstd", of_zstd)])
+def test_a_bag_of_packed_clouds_is_the_same_recording(
+    tmp_path: Path, form: str, pack: Callable[[NDArray[Any]], bytes]
+) -> None:
+    native = open_source(str(Bag(drive_messages()).write(tmp_path / "native.mcap")))
+    packed = open_source(bag_of_packed(tmp_path / "bag", form, pack))
+    expected, result = (
+        [one.xyz_m for one in recording.messages() if isinstance(one, LidarFrame)] for recording in (native, packed)
+    )
+    assert len(result) == len(expected) > 0
+    for a, b in zip(result, expected, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    packed = of_draco(points()[:4])
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+    with pytest.raises(SourceError, match=r"pip install 'coec\[draco\]'; or unpack them with `ros2 run"):
+        open_source(bag_of_packed(tmp_path / "bag", "draco", lambda _: packed))
