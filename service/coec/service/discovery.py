@@ -9,6 +9,7 @@ import json
 import logging
 import re
 import threading
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -69,6 +70,11 @@ INTRINSICS, EXTRINSIC, CAMERA_FRAME, LIDAR_FRAME, CLOUD, EGO = (
 """Places of a pair's configuration that can be found on the bus."""
 
 
+LATEST = 32
+"""Frames of a stream whose names are compared: at four a second those of eight seconds, so that a driver that was
+started with another name is soon forgotten."""
+
+
 @dataclass(frozen=True, slots=True)
 class ReceivedImage:
     """The latest image: the frame in its header and its size, px."""
@@ -81,6 +87,7 @@ class ReceivedImage:
 @dataclass(slots=True)
 class ReceivedMetadata:
     """What was heard of one pair so far. `cloud` and `ego` are the frame names in the latest cloud and motion.
+    `names` has the frames that the latest messages of a stream (`camera`, `lidar`) name.
     `refused` says for a source (`camera`, `lidar`, `ego`, `info`) why its latest message could not be used.
     `max_message_bytes` is the largest message that the session lets through."""
 
@@ -88,8 +95,13 @@ class ReceivedMetadata:
     cloud: str | None = None
     ego: str | None = None
     info: CameraInfoContent | None = None
+    names: dict[str, deque[str]] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
     max_message_bytes: int = LimitsConfig().max_message_bytes
+
+    def add_name(self, stream: str, frame_id: str) -> None:
+        """Notes the frame that a message of a stream names."""
+        self.names.setdefault(stream, deque(maxlen=LATEST)).append(frame_id)
 
     def dropped_bytes(self, pair: OpenPairConfig) -> int:
         """Bytes of a raw colour image of the size in the `CameraInfo`, if that is above the limit, so that Zenoh drops
@@ -226,6 +238,7 @@ class _Search:
         assert image is not None
         if not image.frame_id:
             raise _MissingError(Reason("no_frame_id", _frameless("Images", pair.camera, "camera.frame_id")))
+        self._require_one_frame("camera", "images", pair.camera, CAMERA_FRAME)
         self.origins[CAMERA_FRAME] = f"the latest image on {pair.camera.place} before the pair was built"
         return image.frame_id
 
@@ -237,6 +250,7 @@ class _Search:
             raise _MissingError(Reason("no_cloud", self._silent("lidar", "cloud", lidar.place)))
         if not cloud:
             raise _MissingError(Reason("no_frame_id", _frameless("Clouds", lidar, "lidar.cloud_frame_id")))
+        self._require_one_frame("lidar", "clouds", lidar, "lidar.cloud_frame_id")
         if lidar.frame_id is None:
             self.origins[LIDAR_FRAME] = f"the latest cloud on {lidar.place} before the pair was built"
         return cloud
@@ -251,10 +265,13 @@ class _Search:
         given, info = self._pair.T_camera_lidar, self._received.info
         if given is not None or camera is None or lidar is None:
             return given
+        optical = None if info is None or self._transforms.transform(camera, lidar) is not None else info.frame_id
+        if not optical or self._transforms.transform(optical, lidar) is None:
+            return self._rows(EXTRINSIC, camera, lidar)
         # A driver may name another frame in its images than in the CameraInfo, which is that of the lens.
-        if info is not None and info.frame_id and self._transforms.transform(camera, lidar) is None:
-            camera = info.frame_id if self._transforms.transform(info.frame_id, lidar) is not None else camera
-        return self._rows(EXTRINSIC, camera, lidar)
+        rows = self._rows(EXTRINSIC, optical, lidar)
+        self.origins[EXTRINSIC] += f"; the frame is that of the CameraInfo, the images name {_named(camera)}"
+        return rows
 
     def T_lidar_ego(self, lidar: str | None) -> Matrix4x4 | None:
         ego, frame = self._pair.ego, self._received.ego
@@ -278,8 +295,19 @@ class _Search:
             raise _MissingError(
                 Reason("tf_static_no_tree", f"{TF_STATIC} is no tree between {names}: {'; '.join(doubts)}.")
             )
-        self.origins[place] = f"{TF_STATIC}, between {names}"
+        changes = self._transforms.changes(target, source)
+        self.origins[place] = "; ".join((f"{TF_STATIC}, between {names}", *changes))
         return matrix_rows(T_target_source)
+
+    def _require_one_frame(self, stream: str, what: str, config: AnyStreamConfig, place: str) -> None:
+        counts = Counter(bare(name) for name in self._received.names.get(stream, ()))
+        if len(counts) > 1:
+            named = ", ".join(f"{_named(frame)} ({count})" for frame, count in counts.most_common(SHOWN_FRAMES))
+            text = (
+                f"The latest {what} on {config.place} name {len(counts)} frames: {named}. Two sensors publish on it: "
+                f"give each a topic of its own, or choose one with {place}."
+            )
+            raise _MissingError(Reason("several_sensors", text))
 
     def _silent(self, stream: str, what: str, place: str) -> str:
         refused = self._received.refused.get(stream)

@@ -254,15 +254,17 @@ class DiscoveryListener:
 
     def _take_frame(self, each: _PendingPair, stream: str, sample: InputSample) -> None:
         received = each.received
-        before = (received.image, received.cloud, received.ego)
+        before = (received.image, received.cloud, received.ego, _names(received))
         match each.samples[stream].frame(sample):
             case CameraFrame() as frame:
                 received.image = ReceivedImage(frame.frame_id, frame.image.width, frame.image.height)
+                received.add_name(stream, frame.frame_id)
             case LidarFrame() as frame:
                 received.cloud = frame.frame_id
+                received.add_name(stream, frame.frame_id)
             case EgoMotion() as frame:
                 received.ego = frame.frame_id
-        each.news |= before != (received.image, received.cloud, received.ego)
+        each.news |= before != (received.image, received.cloud, received.ego, _names(received))
 
     def _nominal(self, each: _PendingPair) -> NominalStatus:
         each.news = False
@@ -285,6 +287,10 @@ class DiscoveryListener:
         with self._condition:
             of_transforms = {f"{TRANSFORMS}_{cause}": count for cause, count in self._transforms_lost.items()}
         return {**of_transforms, **each.lost}
+
+
+def _names(received: ReceivedMetadata) -> set[tuple[str, str]]:
+    return {(stream, name) for stream, names in received.names.items() for name in names}
 
 
 def _attempt(take: Callable[[], None]) -> str | None:

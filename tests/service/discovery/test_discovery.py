@@ -14,6 +14,7 @@ from coec.geometry import se3
 from coec.io.ros.camera_info import CameraInfoContent
 from coec.io.ros.transforms import StaticTransform, StaticTransforms
 from coec.service.discovery import (
+    LATEST,
     DiscoveredPair,
     ReceivedImage,
     ReceivedMetadata,
@@ -97,8 +98,43 @@ def test_the_frame_of_the_camera_info_leads_to_the_lidar_where_that_of_the_image
     result = detected(pair(), received(image=image, info=info))
     assert result.pair.camera.frame_id == "no_such_frame", "images of another frame are refused"
     np.testing.assert_allclose(result.pair.T_camera_lidar, T_CAMERA_TOP, rtol=0, atol=1e-12)
-    assert result.origins["T_camera_lidar"] == "/tf_static, between 'cam' and 'top'"
+    assert result.origins["T_camera_lidar"] == (
+        "/tf_static, between 'cam' and 'top'; the frame is that of the CameraInfo, the images name 'no_such_frame'"
+    )
     assert missing(pair(), received(image=image, info=replace(INFO, frame_id="nor_this"))) == ["tf_static"]
+
+
+def test_a_transform_with_several_values_is_named() -> None:
+    transforms = tree(*VEHICLE)
+    transforms.add((StaticTransform("base", "top", T_BASE_TOP @ se3.exp(np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.5]))),))
+    origin = detected(pair(), transforms=transforms).origins["T_camera_lidar"]
+    assert "'base' -> 'top' comes with several values" in origin
+    assert "5.73 deg and" in origin
+
+
+@pytest.mark.parametrize(
+    ("stream", "given", "place"),
+    [
+        ("camera", {"camera": {"topic": "/front/image_raw", "frame_id": "cam"}}, "camera.frame_id"),
+        ("lidar", {"lidar": {"topic": "/top/points", "cloud_frame_id": "top"}, "points": None}, "lidar.cloud_frame_id"),
+    ],
+)
+def test_two_sensors_on_one_topic_are_a_cause_until_one_is_selected(stream: str, given: Any, place: str) -> None:
+    reported = received()
+    for frame in ("cam", "cam", "other") if stream == "camera" else ("top", "top", "other"):
+        reported.add_name(stream, frame)
+    result = discover(pair(), reported, tree(*VEHICLE))
+    assert isinstance(result, tuple)
+    assert [reason.code for reason in result] == ["several_sensors"]
+    assert f"(2), 'other' (1). Two sensors publish on it: give each a topic of its own, or choose one with {place}" in (
+        result[0].text
+    )
+    document = {"name": "front", "camera": "/front/image_raw", "points": "/top/points", **given}
+    selected = OpenPairConfig.model_validate({key: value for key, value in document.items() if value is not None})
+    assert detected(selected, reported).pair.camera.frame_id == "cam"
+    for _ in range(LATEST):
+        reported.add_name(stream, "cam" if stream == "camera" else "top")
+    detected(pair(), reported)
 
 
 def test_a_lidar_whose_clouds_come_in_another_frame() -> None:

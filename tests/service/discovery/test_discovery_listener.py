@@ -251,3 +251,13 @@ def test_an_empty_camera_info_takes_nothing_away() -> None:
     watch.update()
     assert codes(watch) == ["being_built"]
     assert watch.nominal("front").losses == {"info_uncalibrated": 1}
+
+
+def test_two_cameras_on_one_topic_are_named_while_a_pair_is_pending() -> None:
+    watch = DiscoveryListener(CONFIG, {})
+    watch.take_info("front", INFO)
+    for frame in ("camera", "camera_right"):
+        watch.take_frame("front", CAMERA, cdr(compressed_image(frame_id=frame), messages.COMPRESSED_IMAGE))
+        watch.update()
+    (reason,) = (each for each in watch.nominal("front").awaits if each.code == "several_sensors")
+    assert "name 2 frames: 'camera' (1), 'camera_right' (1)" in reason.text

@@ -224,6 +224,10 @@ PROBLEMS: Mapping[str, Problem] = {
         "The headers of a stream contain no frame id.",
         "Set the frame that the text names, or configure the driver to send it.",
     ),
+    "several_sensors": Problem(
+        "The images or clouds on one topic name several frames, so that several sensors publish on it.",
+        "Give each sensor a topic of its own, or set the frame that the text names: frames of others are refused.",
+    ),
     "no_camera_info": Problem(
         "A pair waits for the `CameraInfo` that gives the intrinsics.",
         "Configure the driver to publish it, set its topic in `camera.info_topic`, or set `camera.intrinsics`.",
