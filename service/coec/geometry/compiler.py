@@ -20,10 +20,12 @@ Importing this module loads a compiler: 70 MB and a third of a second, which the
 import fcntl
 import hashlib
 import os
+import shutil
 import stat
 import tempfile
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, cast
 
@@ -66,6 +68,12 @@ _HASH_DIGITS = 12
 _PACKAGES = ("coec", "coec_lab")
 """The packages of this program."""
 
+_KERNELS = "kernels-"
+"""How the name of a directory of kernels begins; a hash follows."""
+
+_UNUSED_S = 30 * 86_400.0
+"""After which time kernels that no process begins with are removed: 10 to 80 MB for each version that was installed."""
+
 _FRESH = "coec-fresh-"
 """How the name of a directory begins that only one process uses."""
 
@@ -103,20 +111,33 @@ def _private_directory(directory: Path) -> bool:
     )
 
 
+def _remove_unused(directory: Path) -> None:
+    """Removes the directories beside `directory` whose kernels no process has begun with for `_UNUSED_S`."""
+    for other in directory.parent.glob(f"{_KERNELS}*"):
+        with suppress(OSError):
+            if other != directory and time.time() - other.lstat().st_mtime > _UNUSED_S:
+                shutil.rmtree(other)
+
+
 def kernel_cache_directory(package: Path) -> Path:
     """A private, writable directory for the compiled kernels of the sources below `package`.
 
     `<user cache>/coec/kernels-<hash>`, else `<temporary folder>/coec-kernels-<user>-<hash>`, else a fresh temporary
-    directory (then every process compiles anew).
+    directory (then every process compiles anew). The first process of a version removes the directories of versions
+    that have not run for a month.
     """
-    name = f"kernels-{_sources_hash(package)}"
+    name = f"{_KERNELS}{_sources_hash(package)}"
     temporary = Path(tempfile.gettempdir()) / f"coec-{os.geteuid()}-{name}"
     try:
         candidates = [_user_cache_root() / "coec" / name, temporary]
     except RuntimeError:
         candidates = [temporary]
     for candidate in candidates:
+        is_new = not candidate.exists()
         if _private_directory(candidate):
+            os.utime(candidate)
+            if is_new:
+                _remove_unused(candidate)
             return candidate
     return Path(tempfile.mkdtemp(prefix=f"{_FRESH}{name}-"))
 
