@@ -3,6 +3,7 @@ packed by the library that packs such clouds."""
 
 from __future__ import annotations
 
+import base64
 import importlib.util
 import struct
 import zlib
@@ -238,3 +239,36 @@ def test_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
     with pytest.raises(SourceError, match=r"pip install 'coec\[draco\]'; or unpack them with `ros2 run"):
         open_source(bag_of_packed(tmp_path / "bag", "draco", lambda _: packed))
+
+
+# --- the layout of draco_point_cloud_transport ------------------------------------------------------------------------
+
+KD_TREE = (
+    "RFJBQ08CAwABAIAAAQtkZWR1cGxpY2F0ZQQBAAAAAAgAAAABBgAJAQAAAAkBAAEACQEAAgQJAQADBAQBAAQEBgEABQMbAAAACAAA"
+    "AGwI2Go64/5QGoGUAAAA4P8HAAD4/wEfAAAAAACA/wDsYGEAbNsAJABs22zbAJBOCgAASQAAHCRJACQA2jYAAAAkSQC0xAAAti0A"
+    "EgC2LbYtAEn6AQAACQCA8CQJgCQA2xaAAIAkCYCWGAFA2wYACUDbBtsGgCTyAABAAADgcAAAAADg/wcAAAAAAAAAAABAkgAAA0CS"
+    "AJIAsG0ZAABAAABoiQQAAAAAAAAABAAAAAAAAAAAAIA/AADgQA4AAAAAAABgQQ4AAOC/AADgPw4AAAAAAABEQg4="
+)
+"""Eight points by the C++ library of Draco 1.5.7 as `convertPC2toDraco` calls it: an attribute of one component a
+field, x, y and z each a POSITION; the k-d tree and 14 bits."""
+
+SEQUENTIAL = (
+    "RFJBQ08CAwAAAIAAAQtkZWR1cGxpY2F0ZQQBAAAAAAgAAAABBgAJAQAAAAkBAAEACQEAAgQJAQADBAQBAAQEBgEABQAAAAABAQAA"
+    "gD8AAABAAABAQAAAgEAAAKBAAADAQAAA4EAAAABBAAAAAAAAAEAAAIBAAADAQAAAAEEAACBBAABAQQAAYEEAAAAAAACAvgAAAL8A"
+    "AEC/AACAvwAAoL8AAMC/AADgvwAAAAAAAOBAAABgQQAAqEEAAOBBAAAMQgAAKEIAAERCAAEBAQEDAQgDATgDAFCFAAAAAAMAAAAA"
+    "AQEAGgMBCFsBOAMAUIUAWmICtMQEaIkJ0BIToCUmQEtMgJaYAAAAAIAdLAQ="
+)
+"""The same without quantisation."""
+
+
+@pytest.mark.parametrize(("packed", "share"), [(KD_TREE, 2**-13), (SEQUENTIAL, 0.0)])
+def test_draco_as_ros_packs_it(packed: str, share: float) -> None:
+    pytest.importorskip("DracoPy", reason="needs the extra draco")
+    sweep, index = sweep_of(message("draco", base64.b64decode(packed), width=8)), np.arange(8)
+    expected = np.stack([index + 1.0, 2.0 * index, -0.25 * index], axis=1)
+    order = np.argsort(sweep.xyz_m[:, 0])
+    np.testing.assert_allclose(sweep.xyz_m[order], expected, atol=14.0 * share)
+    assert sweep.ring is not None
+    assert sweep.time_offset_s is not None
+    np.testing.assert_array_equal(sweep.ring[order], index % 4)
+    np.testing.assert_allclose(sweep.time_offset_s[order], 0.01 * index, atol=0.07 * share + 1e-9)
