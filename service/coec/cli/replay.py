@@ -199,7 +199,9 @@ def _replay_drive(recording: RecordingSource, config: Config, begin_s: float, un
 
     with TemporaryDirectory() as folder, console.progress() as bars:
         task = bars.add_task(recording.name, total=max((end_ns - begin_ns) / NS_PER_S, 1e-3))
-        drive = DriveReplay(config, Path(folder), begin_ns, min(len(os.sched_getaffinity(0)), 2))
+        # A second worker only helps if reading and the engine leave it a core.
+        workers = 2 if len(os.sched_getaffinity(0)) > 2 else 1
+        drive = DriveReplay(config, Path(folder), begin_ns, workers)
         return drive.run(frames(), lambda stamp_ns: bars.update(task, completed=(stamp_ns - begin_ns) / NS_PER_S))
 
 

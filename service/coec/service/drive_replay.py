@@ -57,8 +57,9 @@ ATTEMPTS = 3
 
 STOP_S = 5.0
 
-READ_AHEAD_BYTES = 2**28
-"""Frames that may be read before the engine takes them, bytes: those of ten seconds of a LiDAR of 64 beams."""
+READ_AHEAD_BYTES = 2**29
+"""Frames that may be read before the engine takes them, bytes: those of twenty seconds of a LiDAR of 64 beams, which
+are read while the engine waits for a window."""
 
 MOST_CORES = 64.0
 """Budget of a replay: what work costs does not decide what is checked."""
