@@ -51,13 +51,13 @@ def test_an_edit_in_any_source_moves_it(package: Path, tmp_path: Path, monkeypat
     assert len({before, after, kernel_cache_directory(package)}) == 3
 
 
-def test_a_new_version_removes_kernels_that_no_process_began_with_for_a_month(
+def test_a_new_version_removes_kernels_that_no_process_used_for_a_month(
     package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     day_s, now_s = 86_400.0, time.time()
-    begun = {days: tmp_path / "cache" / "coec" / f"kernels-{days:012d}" for days in (31, 29)}
-    for days, directory in begun.items():
+    used = {days: tmp_path / "cache" / "coec" / f"kernels-{days:012d}" for days in (31, 29)}
+    for days, directory in used.items():
         directory.mkdir(parents=True)
         (directory / "kernel.nbi").touch()
         os.utime(directory, (now_s - days * day_s,) * 2)
@@ -65,7 +65,7 @@ def test_a_new_version_removes_kernels_that_no_process_began_with_for_a_month(
     other.mkdir()
     os.utime(other, (0.0, 0.0))
     current = kernel_cache_directory(package)
-    assert sorted(current.parent.iterdir()) == sorted([current, begun[29], other])
+    assert sorted(current.parent.iterdir()) == sorted([current, used[29], other])
     os.utime(current, (0.0, 0.0))
     kernel_cache_directory(package)
     assert now_s - current.stat().st_mtime < day_s  # in use

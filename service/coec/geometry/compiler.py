@@ -23,7 +23,6 @@ import os
 import shutil
 import stat
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -72,7 +71,7 @@ _KERNELS = "kernels-"
 """How the name of a directory of kernels begins; a hash follows."""
 
 _UNUSED_S = 30 * 86_400.0
-"""After which time kernels that no process begins with are removed: 10 to 80 MB for each version that was installed."""
+"""After which time kernels that no process uses are removed: 10 to 80 MB for each version that was installed."""
 
 _FRESH = "coec-fresh-"
 """How the name of a directory begins that only one process uses."""
@@ -112,10 +111,11 @@ def _private_directory(directory: Path) -> bool:
 
 
 def _remove_unused(directory: Path) -> None:
-    """Removes the directories beside `directory` whose kernels no process has begun with for `_UNUSED_S`."""
+    """Removes the directories beside `directory`, which is used now, that no process has used for `_UNUSED_S`."""
+    now_s = directory.stat().st_mtime
     for other in directory.parent.glob(f"{_KERNELS}*"):
         with suppress(OSError):
-            if other != directory and time.time() - other.lstat().st_mtime > _UNUSED_S:
+            if now_s - other.lstat().st_mtime > _UNUSED_S:
                 shutil.rmtree(other)
 
 
