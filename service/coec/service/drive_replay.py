@@ -149,7 +149,7 @@ class _ReplayVehicle(Vehicle):
 
 
 class _ReplayWorkers:
-    """Worker processes in place of the one of the service: the first solves, the last checks."""
+    """One or more worker processes in place of the one of the service: the first solves, the last checks."""
 
     warms_up = False
     compiled_s = 0.0
