@@ -65,6 +65,8 @@ def test_an_inverse_pose_is_named_and_fixed(coec: Coec, tmp_path: Path, rig: Rig
     outcome = coec("calibrate", folder, "--depth", "stereo", "--fix")
     assert outcome.status == 1
     assert "T_camera_lidar is called T_lidar_camera" in outcome.err
+    after_verdict = outcome.out.partition("\nverdict ")[2].splitlines()[1]
+    assert after_verdict.startswith("  probable cause: "), "the cause is named before what it makes other figures say"
     fixed = folder / "dataset.fixed.yaml"
     assert fixed.read_text() == before.replace("T_camera_lidar", "T_lidar_camera")
     assert (folder / "dataset.yaml").read_text() == before

@@ -44,10 +44,9 @@ def show(
     `intrinsics` says whether the lens is shown, too."""
     console.show(f"{window.window_id}: {count(result.pairs, 'pair')}, {result.points_in_view} points in view")
     _show_axes(window, result)
-    console.show_verdict(result)
-    if not _accepted(result):
-        if document["mistake"] is not None:
-            console.show(document["mistake"]["text"], "bold yellow")
+    refused = not _accepted(result)
+    console.show_verdict(result, document["mistake"]["text"] if refused and document["mistake"] is not None else "")
+    if refused:
         console.show("what follows was not accepted: it is the best guess, and not to be used on a vehicle", "yellow")
     show_pose(
         result.camera_from_lidar, result.lidar_frame, result.camera_frame, warning="" if _accepted(result) else REFUSED

@@ -341,9 +341,11 @@ def styled(state: str) -> Text:
     return Text(plain(state), style=STATE_STYLES.get(state, "bold"))
 
 
-def show_verdict(result: replies.CalibrationResult) -> None:
-    """Prints the decision, the reasons in words, and every figure beside its limit."""
+def show_verdict(result: replies.CalibrationResult, mistake: str = "") -> None:
+    """Prints the decision, a mistake in the inputs as its cause, the reasons, and every figure beside its limit."""
     out.print("verdict ", styled(result.verdict.decision), sep="")
+    if mistake:
+        show(f"  probable cause: {mistake}", "bold yellow")
     for reason in result.verdict.reasons:
         out.print(
             Text(f"  {plain(reason.text)}", "yellow"), Text(f" ({plain(reason.code)})", "dim"), sep="", soft_wrap=True
