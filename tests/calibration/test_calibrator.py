@@ -59,6 +59,26 @@ def test_six_degrees_of_freedom(street: Window, stereo: DepthModel) -> None:
     assert estimate.solved.all()
 
 
+def test_a_single_frame_gives_a_rotation(sharp_street: Window, stereo: DepthModel) -> None:
+    """What frames have in common is no question of one; where shifts are searched, too, one view has to say more."""
+    one = replace(sharp_street, pairs=sharp_street.pairs[4:5])
+    estimate = solve(from_start(one, 6, -5, 4), stereo, CalibrationConfig())
+    assert estimate.verdict.decision is Decision.ACCEPTED
+    assert np.abs(error_deg(estimate)).max() < 4.0 * np.degrees(estimate.sigma[:3]).max() < 1.2
+    assert "edges_once" not in {metric.name for metric in estimate.verdict.metrics}
+    with_shifts = solve(one, stereo, CalibrationConfig(search=SearchConfig(dof=6)))
+    assert "edges_once" in {metric.name for metric in with_shifts.verdict.metrics}
+
+
+@pytest.mark.fault("another frame's sweep with a single image", "the result is not believed")
+def test_a_single_image_with_the_sweep_of_another_place_is_not_believed(
+    sharp_street: Window, stereo: DepthModel
+) -> None:
+    image, sweep = sharp_street.pairs[1], sharp_street.pairs[-2]
+    mixed = replace(sharp_street, pairs=(replace(image, lidar=replace(sweep.lidar, stamp_ns=image.lidar.stamp_ns)),))
+    assert solve(mixed, stereo, CalibrationConfig()).verdict.decision is Decision.FAILED
+
+
 def test_same_input_same_bits(street: Window, stereo: DepthModel) -> None:
     first, second = (solve(from_start(street, 3, -3, 3), stereo) for _ in range(2))
     assert first.optimum.T_camera_lidar.tobytes() == second.optimum.T_camera_lidar.tobytes()

@@ -34,7 +34,7 @@ from coec.calibration.types import (
 )
 from coec.calibration.uncertainty import posterior
 from coec.calibration.uncertainty.covariance import AssessedOptimum
-from coec.config import VerdictConfig
+from coec.config import CalibrationConfig, VerdictConfig
 from coec.geometry import se3
 
 ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)
@@ -59,6 +59,9 @@ _CONTRADICTED = {posterior.CENTRE_OFF: "the held centre", posterior.CLOCKS_OFF: 
 
 CAUSES = frozenset({INTRINSICS_OFF, MOVED})
 """Codes of reasons that explain the others: they are named first."""
+
+SINGLE_FRAME = 1.2
+"""Edge contrast that a single frame has to have, over that of a window. See docs/measured.md."""
 
 EVEN_CERTAINTY = 1.5
 """Certainty at which the intrinsics are as likely off as right: three standard deviations, each half a unit."""
@@ -143,22 +146,33 @@ def _also_on_the_sharpest(metrics: tuple[Metric, ...], evaluation: Evaluation) -
     )
 
 
+def _of_a_single_frame(metric: Metric) -> Metric:
+    return replace(metric, limit=SINGLE_FRAME * metric.limit) if metric.name == EDGE_CONTRAST else metric
+
+
 def optimum_metrics(
     of_objective: tuple[Metric, ...],
     evaluation: Evaluation,
     optimum: AssessedOptimum,
     change: ChangePoint | None,
     pairs: Sequence[FramePair],
-    limits: VerdictConfig,
+    config: CalibrationConfig,
 ) -> tuple[Metric, ...]:
     """All metrics of an optimum: those of its objective, of its shape, of its edges, and of a change within the window.
-    `evaluation` is that of the objective at the optimum."""
+    `evaluation` is that of the objective at the optimum.
+
+    A single frame repeats nothing, and its edge contrast counts all edges once. So that has to be larger, and
+    repetition is no metric of it, unless translation is searched: within one view, a shift fits one near object.
+    """
+    limits = config.verdict
+    repeats = len(pairs) > 1 or config.search.dof == 6
+    of_edges = _also_on_the_sharpest(
+        counted_once(of_objective, optimum.uncertainty.independent_samples, len(pairs)), evaluation
+    )
     return (
-        *_also_on_the_sharpest(
-            counted_once(of_objective, optimum.uncertainty.independent_samples, len(pairs)), evaluation
-        ),
+        *(of_edges if repeats else (_of_a_single_frame(metric) for metric in of_edges)),
         *shape_metrics(evaluation, optimum.curvature, optimum.sigma, limits),
-        *repetition_metric(optimum.independent, limits),
+        *(repetition_metric(optimum.independent, limits) if repeats else ()),
         *intrinsics_metric(optimum.posterior, limits),
         *change_metric(change, limits),
     )
