@@ -61,7 +61,7 @@ def show(
         )
     for note in remarks(document):
         console.show(note)
-    if result.independent_looks is not None:
+    if result.independent_looks is not None and result.pairs > 1:
         console.show(
             f"{result.pairs} pairs are worth {result.independent_looks:.1f} independent samples{_together(result)}"
         )
