@@ -165,7 +165,7 @@ def read_records(stream: BinaryIO, *, max_unpacked_bytes: int | None = None) -> 
 
 class MessageReader:
     """Reads messages again by their place. It keeps the last unpacked chunk, so that reading in order unpacks each
-    chunk once. The CRC of a chunk was checked when its messages were found, and is not checked again."""
+    chunk once."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -188,7 +188,7 @@ class MessageReader:
             if opcode != Opcode.CHUNK:
                 raise McapDamagedError(f"byte {chunk_at}: the chunk is missing: the file has changed")
             body_at = chunk_at + _PREFIX.size
-            self._chunk = _unpack_chunk(_read(self._stream, span, body_at, self._size), body_at, checked=True)
+            self._chunk = _unpack_chunk(_read(self._stream, span, body_at, self._size), body_at)
             self._chunk_at = chunk_at
         return bytes(self._chunk[at : at + length])
 
@@ -300,7 +300,7 @@ def _attachment(body: memoryview, at: int) -> McapAttachment:
     return attachment
 
 
-def _unpack_chunk(body: bytes, at: int, *, checked: bool = False) -> memoryview:
+def _unpack_chunk(body: bytes, at: int) -> memoryview:
     cursor = _Cursor(body, at)
     _, _, promised, expected = cursor.unpack(_CHUNK)
     compression, packed = cursor.text(), cursor.blob("<Q")
@@ -323,7 +323,7 @@ def _unpack_chunk(body: bytes, at: int, *, checked: bool = False) -> memoryview:
                 raise McapDamagedError(f"byte {at}: a chunk has a compression that is neither lz4 nor zstd")
     except (RuntimeError, zstandard.ZstdError) as error:
         raise McapDamagedError(f"byte {at}: a chunk cannot be unpacked") from error
-    if len(data) != promised or (expected and not checked and zlib.crc32(data) != expected):
+    if len(data) != promised or (expected and zlib.crc32(data) != expected):
         raise McapDamagedError(f"byte {at}: size or CRC of a chunk does not agree")
     return memoryview(data)
 
