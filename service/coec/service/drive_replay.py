@@ -68,7 +68,7 @@ MOST_CORES = 64.0
 def read_ahead(frames: Iterator[Frame], max_bytes: int) -> Iterator[Frame]:
     """The same frames, read on a thread of their own while earlier ones are used. Up to `max_bytes` of them wait."""
     condition = threading.Condition()
-    waiting: deque[Frame | Exception | None] = deque()
+    waiting: deque[tuple[Frame | Exception | None, int]] = deque()
     waiting_bytes, is_open = 0, True
 
     def put(item: Frame | Exception | None) -> bool:
@@ -76,7 +76,7 @@ def read_ahead(frames: Iterator[Frame], max_bytes: int) -> Iterator[Frame]:
         size = 0 if item is None or isinstance(item, Exception) else frame_bytes(item)
         with condition:
             condition.wait_for(lambda: not is_open or not waiting or waiting_bytes + size <= max_bytes)
-            waiting.append(item)
+            waiting.append((item, size))
             waiting_bytes += size
             condition.notify_all()
             return is_open
@@ -94,8 +94,8 @@ def read_ahead(frames: Iterator[Frame], max_bytes: int) -> Iterator[Frame]:
         while True:
             with condition:
                 condition.wait_for(lambda: waiting)
-                item = waiting.popleft()
-                waiting_bytes -= 0 if item is None or isinstance(item, Exception) else frame_bytes(item)
+                item, size = waiting.popleft()
+                waiting_bytes -= size
                 condition.notify_all()
             if item is None:
                 return
