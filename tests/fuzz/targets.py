@@ -50,11 +50,13 @@ from coec.io.msgpack_frames import decode_camera, decode_ego, decode_lidar
 from coec.io.recordings.cloud_files import load_cloud
 from coec.io.recordings.kitti import read_numbers, read_stamps
 from coec.io.recordings.layouts import open_source
+from coec.io.recordings.packet_streams import PacketStream
 from coec.io.recordings.recording_source import RecordingSource
 from coec.io.rig_files import baseline_to_json, camera_of, load_baseline, rig_of, rig_to_json
 from coec.io.ros import message_decoding, message_encoding, messages
 from coec.io.ros.camera_info import decode_info, intrinsics_of_info
 from coec.io.ros.message_decoding import ENCODINGS
+from coec.io.ros.ouster_packets import OusterSensor
 from coec.io.ros.transforms import MovingFrame, StaticTransforms, decode_static_transforms, frames_in
 from coec.io.ros.translations import TRANSLATIONS, translation_of
 from coec.io.serialise import estimate_of, result_of
@@ -102,6 +104,7 @@ from fuzz.formats import (
 )
 from fuzz.loop import Target
 from support.estimates import ESTIMATE_RIG, a_baseline, estimate
+from support.packets import PIXELS, Ouster
 from support.recordings import npy, npz, pcd
 from support.ros import (
     JPEG,
@@ -437,6 +440,33 @@ def _video_seeds() -> list[bytes]:
     return [
         codec + b"".join(struct.pack("<H", len(packet)) + packet for packet in packets) for codec, packets in streams
     ]
+
+
+def _packets(data: bytes, folder: Path) -> None:
+    """Metadata behind their length, and packets behind theirs."""
+    del folder
+    texts, at = [], 0
+    while at + 2 <= len(data):
+        (length,) = struct.unpack_from("<H", data, at)
+        texts.append(data[at + 2 : at + 2 + length])
+        at += 2 + length
+    stream = PacketStream()
+    for number, packet in enumerate(texts[1:]):
+        stream.add(Packer().octets(packet).done(), (number,), 1000 * number)
+    sensor = OusterSensor.from_metadata(texts[0] if texts else b"")
+    for sweep in stream.sweeps(sensor)[0]:
+        _inspected(sweep.load(lambda place: Packer().octets(texts[1 + place[0]]).done()))
+
+
+def _packets_seeds() -> list[bytes]:
+    seeds = []
+    for profile in PIXELS:
+        sensor = Ouster(profile, columns=32)
+        ranges = np.full((32, 4), 5000)
+        packets = [one for frame in range(2) for one in sensor.packets(ranges, ranges, frame * 10**8, frame, 10**6)]
+        texts = [sensor.metadata(), *packets]
+        seeds.append(b"".join(struct.pack("<H", len(text)) + text for text in texts))
+    return seeds
 
 
 SCHEMAS = (
@@ -966,6 +996,7 @@ TARGETS: Final = {
         Target("ros1", _ros1, _ros1_seeds, labels=(b"op=", b"conn=", b"compression=", b"bz2", b"lz4")),
         Target("translated", _translated, _translated_seeds, labels=(b"timestamp", b"frame_id")),
         Target("video", _video, _video_seeds, labels=(b"\0\0\1\x67", b"\0\0\1\x65", b"\0\0\1\x40\1")),
+        Target("packets", _packets, _packets_seeds, labels=tuple(profile.encode() for profile in PIXELS)),
         Target("nominal", _nominal, _nominal_seeds, (behind(1, checksummed),), (b"equidistant", b"camera", *JSON_TEXT)),
         Target("window", _window, _window_seeds, (in_records,), (b"lz4", b"zstd")),
         Target("selector", _selector, _selector_seeds, labels=(b";", b"=", b"/", b"@v1", b"*", b"?", b"_")),

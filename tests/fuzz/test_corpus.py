@@ -104,6 +104,10 @@ def test_video(held: Replay) -> None:
     held("video")
 
 
+def test_packets(held: Replay) -> None:
+    held("packets")
+
+
 def test_ply(held: Replay) -> None:
     held("ply")
 

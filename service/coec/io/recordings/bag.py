@@ -57,13 +57,14 @@ KEYS = (
     "time",
     "lidar_source",
     "odometry_frame",
+    "metadata",
 )
 
 
 def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSource:
     """`BAG[?camera=/TOPIC][&points=/TOPIC][&odometry=/TOPIC][&intrinsics=FILE or /TOPIC][&camera_frame=NAME]
-    [&lidar_frame=NAME][&moving=PARENT,CHILD][&time=FIELD,UNIT[,BASE]][&lidar_source=N][&odometry_frame=NAME]`, and the
-    keys of `bag_recognition.Readings`.
+    [&lidar_frame=NAME][&moving=PARENT,CHILD][&time=FIELD,UNIT[,BASE]][&lidar_source=N][&odometry_frame=NAME]
+    [&metadata=FILE or /TOPIC]`, and the keys of `bag_recognition.Readings`.
 
     Without a query, a recorded window is opened as such. In any other bag:
 
@@ -78,6 +79,7 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
       the motion, the motion is left out; `odometry_frame` names another frame for it.
     - `time` says how points are timed, if their values leave it open (see `config.PointTimeConfig`).
     - `lidar_source` chooses one LiDAR of a cloud of several (see `adapters.ros.source_field`).
+    - `metadata` describes the LiDAR whose packets are read, if the bag does not, or has several.
 
     Raises:
         UsageError: unknown query key, or an invalid value.
@@ -93,7 +95,7 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
     )
     readings = bag_recognition.Readings.from_query(query)
     storage = open_storage(spec.path)
-    index = bag_index.build_index(storage, clouds)
+    index = bag_index.build_index(storage, clouds, query.get("metadata"))
     camera_topic = index.camera_topic(query.get("camera"))
     lidar_topic = index.lidar_topic(query.get("points"))
     index.require_one_frame(camera_topic, query.get("camera_frame"), "camera_frame")
@@ -103,7 +105,7 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
             index, reader, camera_topic, lidar_topic, (frames, query.get("odometry")), readings
         )
         camera = _first_image(spec.path, _Images(storage, reader, streams.video), streams.camera)
-        cloud = _load(storage, reader, streams.lidar[0], clouds)
+        cloud = _load(storage, reader, streams.lidar[0].clouds[0], clouds)
         motions = [*streams.moved[:1], *(_load(storage, reader, place, clouds) for place in streams.motion[:1])]
         motion = motions[0] if motions else None
         of_transforms = index.connect(query.get("camera_frame", camera.frame_id), cloud.frame_id, reader)
@@ -117,6 +119,7 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
     recognitions = (
         *of_clocks,
         *_of_video(streams.video),
+        *index.streams[lidar_topic].notes,
         *of_transforms,
         *of_rig,
         *(() if of_twists is None else (of_twists,)),
@@ -492,9 +495,8 @@ def _of_video(video: VideoTrack | None) -> tuple[Recognition, ...]:
 def _load(
     storage: BagStorage, reader: BagReader, place: bag_index.MessageLocation, clouds: bag_index.CloudDecoder
 ) -> Frame:
-    data = reader.read(place.at)
     try:
-        return clouds.decode(place.type_name, data)
+        return clouds.load(reader, place)
     except DecodeError as error:
         raise SourceError(f"{storage.path}: the {place.type_name} of {place.stamp_ns} ns: {error}") from error
 

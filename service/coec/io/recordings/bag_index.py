@@ -23,9 +23,13 @@ from pydantic import ValidationError
 from coec.calibration.types import EgoMotion, Frame, Matrix4, Recognition
 from coec.config import LimitsConfig, PointTimeConfig, describe
 from coec.errors import DecodeError, SourceError, UsageError
+from coec.io.recordings import packet_streams
 from coec.io.recordings.bag_storage import MAX_MESSAGE_BYTES, BagMessage, BagReader, BagStorage
+from coec.io.recordings.packet_streams import MAX_DESCRIPTION_BYTES, PacketStream, PacketSweep, metadata_of
 from coec.io.ros import camera_info, message_decoding, messages, packed_clouds, point_clouds
 from coec.io.ros import transforms as ros_transforms
+from coec.io.ros.ouster_packets import OusterSensor
+from coec.io.user_files import expand_home
 from coec.io.video import VideoTrack, codec_of
 from coec.schemas.keys import TF_STATIC
 
@@ -71,11 +75,22 @@ class CloudDecoder:
         """
         return message_decoding.decode(type_name, data, LIMITS, point_time=self.point_time, source=self.source)
 
+    def load(self, reader: BagReader, place: MessageLocation) -> Frame:
+        """The frame at a place.
+
+        Raises:
+            DecodeError: the messages there hold no frame.
+            SourceError: the file is no longer what it was.
+        """
+        if place.packets is not None:
+            return place.packets.load(reader.read)
+        return self.decode(place.type_name, reader.read(place.at))
+
 
 VIDEO_TYPES = (messages.FFMPEG_PACKET, messages.COMPRESSED_VIDEO)
 IMAGE_TYPES = (messages.COMPRESSED_IMAGE, messages.IMAGE, *VIDEO_TYPES)
 POINT_TYPES = (messages.POINT_CLOUD, *point_clouds.TYPES)
-CLOUD_TYPES = (*POINT_TYPES, *packed_clouds.TYPES)
+CLOUD_TYPES = (*POINT_TYPES, *packed_clouds.TYPES, *packet_streams.TYPES)
 VELOCITY_TYPES = (messages.ODOMETRY, messages.TWIST, messages.TWIST_WITH_COVARIANCE)
 ROTATION_TYPES = (messages.IMU,)
 
@@ -91,18 +106,20 @@ UNMOVED: Final = 1e-6
 """Entries of a pose that change by less are constant."""
 
 _HEADER = {1: struct.Struct("<iI"), 0: struct.Struct(">iI")}
-"""`std_msgs/Header.stamp` (sec, nanosec) by the byte order of the message. Every type above begins with it."""
+"""`std_msgs/Header.stamp` (sec, nanosec) by the byte order of the message. Every type above begins with it, apart from
+those of packets."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class MessageLocation:
     """Where a message lies, and the frame that its header names. Places are ordered by the stamp of the header; equal
-    stamps by the order in the bag."""
+    stamps by the order in the bag. Of a sweep in packets, `at` is the first of its messages."""
 
     stamp_ns: int
     at: tuple[int, ...]
     type_name: str = field(compare=False)
     frame_id: str = field(default="", compare=False)
+    packets: PacketSweep | None = field(default=None, compare=False)
 
 
 @dataclass(slots=True)
@@ -112,12 +129,14 @@ class TopicStream:
     Attributes:
         videos: of a topic of video, the packets by the frame that they name; `locations` has those of pictures.
         lags_s: seconds from the stamp of each message until the recorder received it.
+        notes: what to tell of packets.
     """
 
     type_name: str
     locations: list[MessageLocation] = field(default_factory=list)
     videos: dict[str, VideoTrack] = field(default_factory=dict)
     lags_s: array[float] = field(default_factory=lambda: array("d"))
+    notes: tuple[Recognition, ...] = ()
 
     def ordered(self) -> list[MessageLocation]:
         """The places in the order of their stamps."""
@@ -140,6 +159,8 @@ class BagIndex:
         transforms: all static transforms.
         unread: topics of frames in another form, with what they have and what to do.
         transforms_at: places of the messages of all other transforms, by topic, in the order in the bag.
+        packets: messages of packets by topic, until `resolve_packets` makes streams of them.
+        metadata: what LiDARs say of themselves, by topic.
     """
 
     path: Path
@@ -149,6 +170,8 @@ class BagIndex:
     transforms: ros_transforms.StaticTransforms = field(default_factory=ros_transforms.StaticTransforms)
     transforms_at: dict[str, list[tuple[int, ...]]] = field(default_factory=dict)
     unread: dict[str, str] = field(default_factory=dict)
+    packets: dict[str, PacketStream] = field(default_factory=dict)
+    metadata: dict[str, bytes] = field(default_factory=dict)
 
     def topic(self, types: tuple[str, ...], requested: str | None, key: str) -> str:
         """The topic of these types that was asked for, else the only one.
@@ -159,7 +182,7 @@ class BagIndex:
         topic = self.optional_topic(types, requested, key)
         if topic is None:
             advice = "".join(f"; {other} has {text}" for other, text in self.unread.items())
-            others = (*point_clouds.TYPES, *VIDEO_TYPES, *packed_clouds.TYPES)
+            others = (*point_clouds.TYPES, *VIDEO_TYPES, *packed_clouds.TYPES, *packet_streams.TYPES)
             named = " or ".join(name for name in types if name not in others)
             raise SourceError(f"{self.path} has no message of type {named}{advice}")
         return topic
@@ -170,6 +193,8 @@ class BagIndex:
             topic for topic, one in self.streams.items() if one.type_name in types and (one.locations or one.videos)
         ]
         if requested is not None:
+            if requested not in there and requested in self.unread:
+                raise SourceError(f"{self.path}: {requested} has {self.unread[requested]}")
             if requested not in there:
                 raise SourceError(
                     f"{self.path} has no topic {requested} for {key}; there: {', '.join(there) or 'none'}"
@@ -282,7 +307,10 @@ class BagIndex:
             SourceError: the message is not what its topic says.
         """
         name = entry.type_name
-        if name in (*IMAGE_TYPES, *CLOUD_TYPES, *VELOCITY_TYPES, *ROTATION_TYPES):
+        if name in packet_streams.TYPES:
+            packets = self.packets.setdefault(entry.topic, PacketStream())
+            self._decoded(entry, lambda data: packets.add(data, entry.place, entry.logged_ns))
+        elif name in (*IMAGE_TYPES, *CLOUD_TYPES, *VELOCITY_TYPES, *ROTATION_TYPES):
             stream = self.streams.setdefault(entry.topic, TopicStream(name))
             stamp_ns = _header_stamp_ns(entry.data)
             if stamp_ns is None:
@@ -294,6 +322,9 @@ class BagIndex:
                 return
             stream.locations.append(MessageLocation(stamp_ns, entry.place, name, frame_id))
             stream.lags_s.append((entry.logged_ns - stamp_ns) * 1e-9)
+        elif name == messages.STRING and b"beam_altitude_angles" in entry.data[:MAX_DESCRIPTION_BYTES]:
+            if entry.topic in self.metadata or len(self.metadata) < LISTED:
+                self.metadata[entry.topic] = entry.data[entry.data.index(b"{") :].rstrip(b"\0")
         elif name == messages.CAMERA_INFO:
             self._decoded(entry, self.infos.setdefault(entry.topic, camera_info.CameraInfos()).add)
         elif name == messages.TF and entry.topic == TF_STATIC:
@@ -304,6 +335,27 @@ class BagIndex:
             self._leave_unread(entry.topic, f"{name}: {message_decoding.REFUSED[name]}")
         elif name == messages.TF:
             self.transforms_at.setdefault(entry.topic, []).append(entry.place)
+
+    def resolve_packets(self, metadata: bytes | str | None) -> None:
+        """Makes the sweeps of all packets, after the whole bag was read. `metadata`: those of the LiDAR, or their
+        topic, if a person says so."""
+        for topic, packets in self.packets.items():
+            try:
+                sensor = OusterSensor.from_metadata(metadata_of(topic, self.metadata, metadata))
+                sweeps, notes = packets.sweeps(sensor)
+            except DecodeError as error:
+                self._leave_unread(topic, f"packets of a LiDAR: {error}")
+                continue
+            stream = self.streams.setdefault(topic, TopicStream(packet_streams.TYPES[0], notes=notes))
+            for sweep in sweeps:
+                place = MessageLocation(sweep.stamp_ns, sweep.places[0], stream.type_name, sensor.frame_id, sweep)
+                stream.locations.append(place)
+                stream.lags_s.append((sweep.logged_ns - sweep.stamp_ns) * 1e-9)
+            parent, T_parent_child = sensor.pose
+            if sensor.frame_id not in self.transforms.frames and parent in self.transforms.frames:
+                with suppress(DecodeError):
+                    joint = ros_transforms.StaticTransform(parent, sensor.frame_id, T_parent_child)
+                    self.transforms.add((joint,))
 
     def _leave_unread(self, topic: str, text: str) -> None:
         if len(self.unread) < LISTED:
@@ -346,8 +398,9 @@ def video_left_out(track: VideoTrack) -> str:
     return ", ".join(f"{count} {cause}" for cause, count in track.left_out.items()) or "there is none"
 
 
-def build_index(storage: BagStorage, clouds: CloudDecoder) -> BagIndex:
-    """Makes the index of a bag whose clouds are read by `clouds`.
+def build_index(storage: BagStorage, clouds: CloudDecoder, metadata: str | None = None) -> BagIndex:
+    """Makes the index of a bag whose clouds are read by `clouds`. `metadata`: a file or a topic with those of the LiDAR
+    whose packets are read.
 
     Raises:
         SourceError: a file is absent, cut off or damaged, or a message is not what its topic says.
@@ -355,6 +408,14 @@ def build_index(storage: BagStorage, clouds: CloudDecoder) -> BagIndex:
     index = BagIndex(storage.path, clouds)
     for entry in storage.entries():
         index.add(entry)
+    given: bytes | str | None = metadata
+    if metadata is not None and metadata not in index.metadata:
+        try:
+            with expand_home(metadata).open("rb") as file:
+                given = file.read(MAX_DESCRIPTION_BYTES)
+        except OSError as error:
+            raise SourceError(f"cannot read metadata={metadata}: {error.strerror}") from error
+    index.resolve_packets(given)
     return index
 
 

@@ -192,10 +192,9 @@ def lidars_of_bag(spec: SourceSpec, a: str, b: str) -> LidarRecording:
 
 
 def _load(storage: BagStorage, place: MessageLocation) -> LidarFrame | EgoMotion:
-    with storage.open() as reader:
-        data = reader.read(place.at)
     try:
-        frame = AS_THEY_ARE.decode(place.type_name, data)
+        with storage.open() as reader:
+            frame = AS_THEY_ARE.load(reader, place)
     except DecodeError as error:
         raise SourceError(f"{storage.path}: the {place.type_name} of {place.stamp_ns} ns: {error}") from error
     if not isinstance(frame, LidarFrame | EgoMotion):

@@ -327,7 +327,7 @@ _PACKED: Final = f"packed clouds are read from recordings only: {packed_clouds.U
 _PACKETS: Final = (
     "packets of the LiDAR are no points: take the topic of PointCloud2 of its driver, or convert them with "
 )
-_OUSTER: Final = f"{_PACKETS}`ros2 launch ouster_ros replay.launch.xml`, which needs the sensor's metadata"
+_OUSTER: Final = "packets of a LiDAR are read from recordings only: take the topic of PointCloud2 of ouster_ros"
 _HESAI: Final = f"{_PACKETS}hesai_ros_driver, `source_type: 3` in its config.yaml (packets from a bag)"
 
 REFUSED: Final = {
@@ -336,9 +336,7 @@ REFUSED: Final = {
     messages.FOXGLOVE_CLOUD: _PACKED,
     "theora_image_transport/msg/Packet": _VIDEO,
     messages.VELODYNE_SCAN: f"{_PACKETS}velodyne_pointcloud (velodyne_transform_node)",
-    "ouster_sensor_msgs/msg/PacketMsg": _OUSTER,
-    "ouster_msgs/msg/PacketMsg": _OUSTER,
-    "ouster_ros/msg/PacketMsg": _OUSTER,
+    **dict.fromkeys(messages.OUSTER_PACKETS, _OUSTER),
     "hesai_ros_driver/msg/UdpFrame": _HESAI,
     "pandar_msgs/msg/PandarScan": f"{_PACKETS}the driver of Hesai or nebula_ros",
     "rslidar_msg/msg/RslidarPacket": f"{_PACKETS}rslidar_sdk, `msg_source: 2` in its config.yaml (packets from ROS)",

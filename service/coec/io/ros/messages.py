@@ -27,6 +27,10 @@ DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
 FFMPEG_PACKET: Final = "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
 COMPRESSED_VIDEO: Final = "foxglove_msgs/msg/CompressedVideo"
 VELODYNE_SCAN: Final = "velodyne_msgs/msg/VelodyneScan"
+OUSTER_PACKETS: Final = tuple(
+    f"{package}/msg/PacketMsg" for package in ("ouster_sensor_msgs", "ouster_msgs", "ouster_ros")
+)
+STRING: Final = "std_msgs/msg/String"
 COMPRESSED_CLOUD: Final = "point_cloud_interfaces/msg/CompressedPointCloud2"
 FOXGLOVE_CLOUD: Final = "foxglove_msgs/msg/CompressedPointCloud"
 
@@ -35,6 +39,7 @@ _DEFINITIONS: Final = {
     "bool is_bigendian\nuint8[] data\n",
     "velodyne_msgs/msg/VelodynePacket": "builtin_interfaces/Time stamp\nuint8[1206] data\n",
     VELODYNE_SCAN: "std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets\n",
+    **dict.fromkeys(OUSTER_PACKETS, "uint8[] buf\n"),
     COMPRESSED_CLOUD: "std_msgs/Header header\nuint32 height\nuint32 width\nsensor_msgs/PointField[] fields\n"
     "bool is_bigendian\nuint32 point_step\nuint32 row_step\nuint8[] compressed_data\nbool is_dense\nstring format\n",
     FOXGLOVE_CLOUD: "builtin_interfaces/Time timestamp\nstring frame_id\ngeometry_msgs/Pose pose\nuint8[] data\n"

@@ -1,0 +1,213 @@
+"""Packets of a LiDAR on a topic of a bag, and the sweeps that they make up.
+
+The index of a bag keeps the beginning of each packet. What a packet means is known only after the whole bag was read,
+because what the sensor says of itself (its metadata) may come late. Then packets are grouped to sweeps by the number of
+the turn in each.
+
+A sensor that is not synchronised counts from its own start. Its times are moved to the clock of the recorder: a packet
+comes late by as much as network and driver need, never before its end, so that the one that came soonest within some
+seconds ties the two clocks; over longer times, clocks of oscillators drift apart.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.types import LidarFrame, Matrix4, Recognition
+from coec.errors import DecodeError
+from coec.io.frame_validation import Refusal
+from coec.io.ros import messages, ouster_packets
+from coec.io.ros.point_clouds import SINCE_S
+
+TYPES: Final = messages.OUSTER_PACKETS
+"""Types of the messages that are read."""
+
+MAX_DESCRIPTION_BYTES: Final = 2**20
+"""Longest text in which a sensor says what it is; Ouster's has some 10 kB."""
+
+MAX_PACKETS: Final = 8192
+"""Most messages of a sweep: as many as a turn may have columns."""
+
+NEIGHBOURS: Final = 100
+"""Sweeps before and after a sweep by which its clock is tied to the recorder's: 10 s each at 10 Hz."""
+
+RESTART_NS: Final = 1_000_000_000
+"""Clocks that differ by more from one sweep to another are those of different starts of the sensor."""
+
+WHOLE: Final = 0.9
+"""Share of the usual number of packets that the first and the last sweep have at least, or are left out: the recorder
+started or ended within them."""
+
+
+class PacketSensor(Protocol):
+    """A sensor whose packets are read; see `ouster_packets.OusterSensor`."""
+
+    @property
+    def frame_id(self) -> str:
+        """Frame of the points, if nobody names another one."""
+
+    @property
+    def pose(self) -> tuple[str, Matrix4] | None:
+        """A frame, and the pose (4, 4) of `frame_id` in it."""
+
+    @property
+    def notes(self) -> tuple[Recognition, ...]:
+        """What is to be said of the points."""
+
+    def heads(self, glimpses: Sequence[bytes]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """(N,) time of each message by the sensor's clock, ns, and (N,) number of its sweep, -1 for something else."""
+
+    def sweep(self, payloads: Sequence[bytes], at_ns: int, stamp_ns: int) -> LidarFrame:
+        """The points of some messages; `at_ns` by the sensor's clock is `stamp_ns` of the recording."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PacketSweep:
+    """The messages of a sweep. It is stamped in its middle.
+
+    Attributes:
+        middle_ns, stamp_ns: its middle, by the sensor's clock and by that of the recording.
+        logged_ns: when the recorder got the message in its middle.
+        places: where the messages lie.
+    """
+
+    sensor: PacketSensor
+    middle_ns: int
+    stamp_ns: int
+    logged_ns: int
+    places: tuple[tuple[int, ...], ...]
+
+    def load(self, read: Callable[[tuple[int, ...]], bytes]) -> LidarFrame:
+        """The sweep.
+
+        Raises:
+            DecodeError: the messages hold no points.
+        """
+        return self.sensor.sweep([read(place) for place in self.places], self.middle_ns, self.stamp_ns)
+
+
+@dataclass(slots=True)
+class PacketStream:
+    """The messages on a topic of packets, in the order in the bag."""
+
+    places: list[tuple[int, ...]] = field(default_factory=list)
+    glimpses: list[bytes] = field(default_factory=list)
+    logged_ns: array[int] = field(default_factory=lambda: array("q"))
+
+    def add(self, payload: bytes, place: tuple[int, ...], logged_ns: int) -> None:
+        """Notes a message.
+
+        Raises:
+            DecodeError: it is not one.
+        """
+        self.glimpses.append(ouster_packets.glimpse(payload))
+        self.places.append(place)
+        self.logged_ns.append(logged_ns)
+
+    def sweeps(self, sensor: PacketSensor) -> tuple[list[PacketSweep], tuple[Recognition, ...]]:
+        """The sweeps, and what to tell of them.
+
+        Raises:
+            DecodeError: the messages are not of this sensor.
+        """
+        times_ns, numbers = sensor.heads(self.glimpses)
+        groups = [np.array(group) for group in _grouped(numbers)]
+        usual = float(np.median([len(group) for group in groups]))
+        for end in (0, -1):
+            if len(groups) > 1 and len(groups[end]) < WHOLE * usual:
+                del groups[end]
+        middles_ns = np.array([_middle(times_ns[group]) for group in groups])
+        logged_ns = np.frombuffer(self.logged_ns, np.int64)[[group[len(group) // 2] for group in groups]]
+        stamps_ns, notes = middles_ns, sensor.notes
+        if np.median(middles_ns) < SINCE_S * 1e9:
+            stamps_ns = middles_ns + _ahead_ns(np.array([self._lag_ns(group, times_ns[group]) for group in groups]))
+            notes = (*notes, _FREE_RUNNING)
+        other = int((numbers < 0).sum())
+        if other:
+            text = f"{other} of {len(numbers)} packets of the LiDAR have another form than its metadata say: left out."
+            notes = (*notes, Recognition("packets_left_out", text, "warn"))
+        times = (middles_ns.tolist(), stamps_ns.tolist(), logged_ns.tolist())
+        sweeps = [
+            PacketSweep(sensor, middle, stamp, logged, tuple(self.places[index] for index in group))
+            for group, middle, stamp, logged in zip(groups, *times, strict=True)
+        ]
+        return sweeps, notes
+
+    def _lag_ns(self, group: NDArray[np.int64], times_ns: NDArray[np.int64]) -> int:
+        """Least time from the end of a packet of a sweep until it was received."""
+        lasts_ns = int(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 0
+        return int((np.frombuffer(self.logged_ns, np.int64)[group] - times_ns).min()) - lasts_ns
+
+
+_FREE_RUNNING: Final = Recognition(
+    "lidar_clock",
+    "The LiDAR's clock counts from its start. Its sweeps are stamped by the times at which the recorder got their "
+    "packets, so that they may be late by the least delay of network and driver: synchronise it (PTP), or say "
+    "?lidar_offset=S.",
+    "warn",
+)
+
+
+def _grouped(numbers: NDArray[np.int64]) -> list[list[int]]:
+    """Indices of the messages of each sweep. A message may come late, among those of the next sweep; numbers repeat
+    after a while, and after a restart."""
+    groups: list[list[int]] = []
+    of_group: list[int] = []
+    for index, number in enumerate(numbers.tolist()):
+        if number < 0:
+            continue
+        for back in range(1, min(2, len(groups)) + 1):
+            if of_group[-back] == number and len(groups[-back]) < MAX_PACKETS:
+                groups[-back].append(index)
+                break
+        else:
+            groups.append([index])
+            of_group.append(number)
+    return groups
+
+
+def _middle(times_ns: NDArray[np.int64]) -> int:
+    """Between the first and the last time; columns that were not measured may have none."""
+    known_ns = times_ns[times_ns > 0]
+    return int(known_ns.min() + np.ptp(known_ns) // 2) if len(known_ns) else 0
+
+
+def _ahead_ns(lags_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(N,) by how much the recorder's clock is ahead of the sensor's at each sweep, from the (N,) lags of receipt."""
+    ahead_ns = lags_ns.copy()
+    for shift in range(1, min(NEIGHBOURS, len(lags_ns) - 1) + 1):
+        for at, near in ((slice(shift, None), slice(-shift)), (slice(-shift), slice(shift, None))):
+            same_start = np.abs(lags_ns[near] - lags_ns[at]) < RESTART_NS
+            np.minimum(ahead_ns[at], lags_ns[near], out=ahead_ns[at], where=same_start)
+    return ahead_ns
+
+
+def metadata_of(topic: str, known: Mapping[str, bytes], given: bytes | str | None) -> bytes:
+    """What the sensor of a topic says of itself.
+
+    Args:
+        topic: of the packets.
+        known: such texts by topic.
+        given: the text, or its topic, if a person says so.
+
+    Raises:
+        DecodeError: `message_type`: there is none, or several.
+    """
+    if isinstance(given, bytes):
+        return given
+    adjacent = [name for name in known if name.rpartition("/")[0] == topic.rpartition("/")[0]]
+    selected = [given] if given is not None else adjacent or list(known)
+    if len(selected) == 1 and selected[0] in known:
+        return known[selected[0]]
+    if not known:
+        raise DecodeError(Refusal.MESSAGE_TYPE, ouster_packets.MISSING)
+    raise DecodeError(
+        Refusal.MESSAGE_TYPE,
+        f"the recording has the metadata of an Ouster on {', '.join(known)}: choose with ?metadata=/TOPIC",
+    )
