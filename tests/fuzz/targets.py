@@ -56,7 +56,6 @@ from coec.io.rig_files import baseline_to_json, camera_of, load_baseline, rig_of
 from coec.io.ros import message_decoding, message_encoding, messages
 from coec.io.ros.camera_info import decode_info, intrinsics_of_info
 from coec.io.ros.message_decoding import ENCODINGS
-from coec.io.ros.ouster_packets import OusterSensor
 from coec.io.ros.transforms import MovingFrame, StaticTransforms, decode_static_transforms, frames_in
 from coec.io.ros.translations import TRANSLATIONS, translation_of
 from coec.io.serialise import estimate_of, result_of
@@ -104,7 +103,17 @@ from fuzz.formats import (
 )
 from fuzz.loop import Target
 from support.estimates import ESTIMATE_RIG, a_baseline, estimate
-from support.packets import PIXELS, Ouster
+from support.packets import (
+    HESAI,
+    HESAIS,
+    OUSTER,
+    PIXELS,
+    Ouster,
+    correction_file,
+    hesai_message,
+    hesai_message_of_ros_1,
+    ouster_message,
+)
 from support.recordings import npy, npz, pcd
 from support.ros import (
     JPEG,
@@ -443,19 +452,23 @@ def _video_seeds() -> list[bytes]:
 
 
 def _packets(data: bytes, folder: Path) -> None:
-    """Metadata behind their length, and packets behind theirs."""
+    """The first byte chooses the maker. What describes the sensor stands behind its length, and messages behind
+    theirs."""
     del folder
-    texts, at = [], 0
-    while at + 2 <= len(data):
-        (length,) = struct.unpack_from("<H", data, at)
-        texts.append(data[at + 2 : at + 2 + length])
-        at += 2 + length
-    stream = PacketStream()
-    for number, packet in enumerate(texts[1:]):
-        stream.add(Packer().octets(packet).done(), (number,), 1000 * number)
-    sensor = OusterSensor.from_metadata(texts[0] if texts else b"")
+    texts, at = [], 1
+    while at + 4 <= len(data):
+        (length,) = struct.unpack_from("<I", data, at)
+        texts.append(data[at + 4 : at + 4 + length])
+        at += 4 + length
+    stream = PacketStream("/packets", PACKETS[(data[0] if data else 0) % len(PACKETS)])
+    for number, message in enumerate(texts[1:]):
+        stream.add(message, (number,), 1000 * number)
+    sensor = stream.sensor({}, texts[0] if texts else b"")
     for sweep in stream.sweeps(sensor)[0]:
-        _inspected(sweep.load(lambda place: Packer().octets(texts[1 + place[0]]).done()))
+        _inspected(sweep.load(lambda place: texts[1 + place[0]]))
+
+
+PACKETS = (OUSTER, HESAI)
 
 
 def _packets_seeds() -> list[bytes]:
@@ -464,9 +477,12 @@ def _packets_seeds() -> list[bytes]:
         sensor = Ouster(profile, columns=32)
         ranges = np.full((32, 4), 5000)
         packets = [one for frame in range(2) for one in sensor.packets(ranges, ranges, frame * 10**8, frame, 10**6)]
-        texts = [sensor.metadata(), *packets]
-        seeds.append(b"".join(struct.pack("<H", len(text)) + text for text in texts))
-    return seeds
+        seeds.append((0, [sensor.metadata(), *map(ouster_message, packets)]))
+    for hesai in HESAIS.values():
+        ranges = np.full((2 * hesai.blocks, hesai.lasers), 1000)
+        correction = correction_file([1.0] * hesai.lasers, [0.5] * hesai.lasers)
+        seeds.append((1, [correction, hesai_message(hesai.packets(ranges, ranges % 251, STAMP_NS, 10**6))]))
+    return [bytes([maker]) + b"".join(struct.pack("<I", len(text)) + text for text in texts) for maker, texts in seeds]
 
 
 SCHEMAS = (
@@ -476,6 +492,7 @@ SCHEMAS = (
     ("json", "foxglove.CameraCalibration"),
     ("ros1", "livox_ros_driver/CustomMsg"),
     ("ros1", "sensor_msgs/PointCloud2"),
+    ("ros1", "pandar_msgs/PandarScan"),
 )
 
 
@@ -510,6 +527,7 @@ def _translated_seeds() -> list[bytes]:
         b"\3" + stamp + b"\x15\x01\0\0\0\x1d\x01\0\0\0\x22\x05mono8\x2d\x01\0\0\0\x32\x01a",
         b"\x08" + calibration,
         *(bytes([kind]) + json.dumps(document).encode() for kind, document in documents.items()),
+        b"\x0c" + hesai_message_of_ros_1([b"\xee\xff" * 20]),
         b"\x0a" + livox + struct.pack("<IfffBBB", 0, 1, 2, 3, 4, 5, 6),
     ]
 
@@ -996,7 +1014,12 @@ TARGETS: Final = {
         Target("ros1", _ros1, _ros1_seeds, labels=(b"op=", b"conn=", b"compression=", b"bz2", b"lz4")),
         Target("translated", _translated, _translated_seeds, labels=(b"timestamp", b"frame_id")),
         Target("video", _video, _video_seeds, labels=(b"\0\0\1\x67", b"\0\0\1\x65", b"\0\0\1\x40\1")),
-        Target("packets", _packets, _packets_seeds, labels=tuple(profile.encode() for profile in PIXELS)),
+        Target(
+            "packets",
+            _packets,
+            _packets_seeds,
+            labels=(*(profile.encode() for profile in PIXELS), b"\xee\xff", b",1.0"),
+        ),
         Target("nominal", _nominal, _nominal_seeds, (behind(1, checksummed),), (b"equidistant", b"camera", *JSON_TEXT)),
         Target("window", _window, _window_seeds, (in_records,), (b"lz4", b"zstd")),
         Target("selector", _selector, _selector_seeds, labels=(b";", b"=", b"/", b"@v1", b"*", b"?", b"_")),

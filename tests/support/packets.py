@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -112,6 +113,135 @@ def ouster_message(packet: bytes) -> bytes:
 
 def string_message(text: bytes) -> bytes:
     return Packer().text(text.decode()).done()
+
+
+HESAI = "hesai_ros_driver/msg/UdpFrame"
+PANDAR = "pandar_msgs/msg/PandarScan"
+NEBULA = "nebula_msgs/msg/NebulaPackets"
+
+
+@dataclass(frozen=True)
+class Hesai:
+    """A sensor of Hesai: how its packets look, after the manual of each model.
+
+    Attributes:
+        head: bytes before the blocks; empty: each block begins with FF EE.
+        unit: bytes of a return.
+        tail: what stands behind the blocks, of the return mode, the date (6 bytes) and the microseconds.
+        block_us: time of the last block after that of the packet, and between blocks; of a QT of the first block.
+    """
+
+    lasers: int
+    blocks: int
+    head: bytes
+    unit: int
+    tail: Callable[[int, bytes, int], bytes]
+    block_us: tuple[float, float]
+    sequence: bytes = b""
+    years_from: int = 1900
+
+    def block_s(self, block: int, returns: int = 1) -> float:
+        last_us, step_us = self.block_us
+        steps = block // returns if self is QT64 else -((self.blocks - 1 - block) // returns)
+        return 1e-6 * (last_us + step_us * steps)
+
+    def packet(
+        self, azimuths: Sequence[float], units: NDArray[Any], intensity: NDArray[Any], stamp_ns: int, mode: int = 0x37
+    ) -> bytes:
+        """Of (blocks, lasers) ranges in units of 4 mm; azimuths in degrees."""
+        packet = self.head
+        for azimuth, ranges, intensities in zip(azimuths, units, intensity, strict=True):
+            packet += b"" if self.head else b"\xff\xee"
+            packet += struct.pack("<H", round(100.0 * azimuth) % 36_000)
+            for one, strength in zip(ranges.tolist(), intensities.tolist(), strict=True):
+                packet += struct.pack("<HB", round(one), round(strength)) + bytes(self.unit - 3)
+        seconds, rest_ns = divmod(stamp_ns, 10**9)
+        when = datetime.fromtimestamp(seconds, UTC)
+        date = bytes([when.year - self.years_from, when.month, when.day, when.hour, when.minute, when.second])
+        return packet + self.tail(mode, date, rest_ns // 1000) + self.sequence
+
+    def packets(
+        self, units: NDArray[Any], intensity: NDArray[Any], begin_ns: int, step_ns: float, first_deg: float = 0.0
+    ) -> list[bytes]:
+        """Packets of a turn of (columns, lasers) ranges that begins at an azimuth."""
+        columns, packets = len(units), []
+        for first in range(0, columns, self.blocks):
+            last = 0 if self is QT64 else self.blocks - 1
+            stamp_ns = begin_ns + round((first + last) * step_ns - 1e9 * self.block_s(last))
+            azimuths = [first_deg + 360.0 * (first + block) / columns for block in range(self.blocks)]
+            part = slice(first, first + self.blocks)
+            packets.append(self.packet(azimuths, units[part], intensity[part], stamp_ns))
+        return packets
+
+
+def _tail_40(mode: int, date: bytes, micros: int) -> bytes:
+    return bytes(8) + struct.pack("<HIBB", 600, micros, mode, 0x42) + date
+
+
+def _tail_qt(mode: int, date: bytes, micros: int) -> bytes:
+    return bytes(10) + struct.pack("<HIBB", 600, micros, mode, 0x42) + date
+
+
+def _tail_xt(mode: int, date: bytes, micros: int) -> bytes:
+    return bytes(10) + struct.pack("<BH", mode, 600) + date + struct.pack("<IB", micros, 0x42)
+
+
+def _tail_128(mode: int, date: bytes, micros: int) -> bytes:
+    """CRC, functional safety; behind it sequence, IMU and CRC."""
+    return bytes(4 + 17 + 9 + 3) + struct.pack("<BH", mode, 600) + date + struct.pack("<IB", micros, 0x42) + bytes(30)
+
+
+def _head(version: tuple[int, int], lasers: int, blocks: int, flags: int) -> bytes:
+    return bytes([0xEE, 0xFF, *version, 0, 0, lasers, blocks, 0, 4, 1, flags])
+
+
+P40 = Hesai(40, 10, b"", 3, _tail_40, (-57.6, 55.56), years_from=2000)
+P64 = Hesai(64, 6, bytes([0xEE, 0xFF, 64, 6, 0, 4, 0, 0]), 3, _tail_40, (-71.6, 55.56), bytes(4), 2000)
+QT64 = Hesai(64, 4, _head((3, 1), 64, 4, 1), 4, _tail_qt, (105.1, 166.7), bytes(4))
+XT16 = Hesai(16, 8, _head((6, 1), 16, 8, 1), 4, _tail_xt, (29.0, 50.0), bytes(4))
+XT32 = Hesai(32, 8, _head((6, 1), 32, 8, 1), 4, _tail_xt, (29.0, 50.0), bytes(4))
+XTM = Hesai(32, 6, _head((6, 1), 32, 6, 1), 4, _tail_xt, (29.0, 50.0), bytes(4))
+P128 = Hesai(128, 2, _head((1, 4), 128, 2, 7), 3, _tail_128, (27.0, 55.56))
+HESAIS = {"40P": P40, "64": P64, "QT64": QT64, "XT-16": XT16, "XT-32": XT32, "XTM": XTM, "128": P128}
+
+
+def correction_file(elevations: Sequence[float], azimuths: Sequence[float], form: str = "Channel") -> bytes:
+    """In degrees, as Hesai's web page gives it."""
+    lines = [
+        f"{number},{one:.3f},{other:.3f}"
+        for number, (one, other) in enumerate(zip(elevations, azimuths, strict=True), 1)
+    ]
+    return "\r\n".join([f"{form},Elevation,Azimuth", *lines, ""]).encode()
+
+
+def hesai_message(
+    packets: Sequence[bytes], type_name: str = HESAI, fixed: int = 0, sec: int = 5, frame: str = "hesai"
+) -> bytes:
+    """`fixed`: the bytes that each packet has, whatever its size, in an old form of the message."""
+    packer = Packer().header(frame, sec, 0).put("I", len(packets))
+    for packet in packets:
+        if type_name != HESAI:
+            packer.put("I", sec, 0)
+        if fixed:
+            packer.body += packet.ljust(fixed, b"\0")
+        else:
+            packer.octets(packet)
+        if type_name != NEBULA:
+            packer.put("I", len(packet))
+    return packer.done()
+
+
+def hesai_message_of_ros_1(packets: Sequence[bytes]) -> bytes:
+    """A `PandarScan`, in which nothing is aligned."""
+    data = struct.pack("<IIII", 7, 5, 0, 5) + b"hesai" + struct.pack("<I", len(packets))
+    for packet in packets:
+        data += struct.pack("<III", 5, 0, len(packet)) + packet + struct.pack("<I", len(packet))
+    return data
+
+
+def bytes_message(data: bytes) -> bytes:
+    """`std_msgs/UInt8MultiArray` without dimensions."""
+    return Packer().put("I", 0, 0).octets(data).done()
 
 
 def gridded(sweep: LidarFrame, columns: int, beams: int) -> tuple[NDArray[Any], NDArray[Any]]:

@@ -18,11 +18,16 @@ from coec.io.ros import messages
 from coec.io.ros.ouster_packets import OusterSensor
 from coec.io.ros.topics import FrameTopics, PairTopics
 from support.packets import (
+    HESAI,
     OUSTER,
     STRING,
+    XT32,
     Entry,
     Ouster,
+    bytes_message,
+    correction_file,
     gridded,
+    hesai_message,
     ouster_message,
     string_message,
     write_entries,
@@ -142,7 +147,7 @@ def test_two_sensors_have_each_their_own_metadata(tmp_path: Path) -> None:
     assert np.abs(front.xyz_m - rear.xyz_m).max() > 0.005
     assert len(open_lidars(str(path), PACKETS, "/rear/lidar_packets").pairs(3)) == 3
     unclear = write_entries(tmp_path / "unclear.mcap", [of_other, elsewhere, *others(), *packets()])
-    with pytest.raises(SourceError, match="metadata of an Ouster on /rear/metadata, /else/metadata: choose"):
+    with pytest.raises(SourceError, match="say what the LiDAR is, /rear/metadata, /else/metadata: choose"):
         open_source(str(unclear))
     selected = sweeps_of(open_source(f"{unclear}?metadata=/rear/metadata"))[0]
     np.testing.assert_array_equal(selected.xyz_m, rear.xyz_m)
@@ -207,6 +212,62 @@ def test_a_packet_that_is_cut_off_is_named(tmp_path: Path) -> None:
         open_source(str(write_entries(tmp_path / "drive.mcap", [HEAD, *others(), damaged])))
 
 
+# --- Hesai ------------------------------------------------------------------------------------------------------------
+
+DIRECTIONS = ([16.0 - 1.1 * laser for laser in range(32)], [0.5] * 32)
+HESAI_MIDDLE_S = 0.1 * (7 + 63) / 64 / 2 - 350e-6 / 2
+"""From the begin of a turn of 64 columns, in packets of 8, to its middle: between the first and the last block. Blocks
+of a packet are 50 us apart."""
+
+CORRECTION: Entry = (
+    BEGIN_NS,
+    "/lidar_corrections",
+    messages.BYTES,
+    bytes_message(correction_file(*DIRECTIONS)),
+)
+
+
+def hesai_turns(turns: int = 6, sensor_begin_ns: int = BEGIN_NS, late_ns: int = 2_000_000) -> list[Entry]:
+    """Turns of an XT-32 of 64 columns at 10 Hz, each in a message that is received after its end."""
+    entries: list[Entry] = []
+    for index in range(turns):
+        units = np.full((64, 32), 1250 + 25 * index)
+        sent = XT32.packets(units, units % 251, sensor_begin_ns + index * SWEEP_NS, SWEEP_NS / 64)
+        received_ns = BEGIN_NS + (index + 1) * SWEEP_NS + late_ns
+        entries.append(
+            (received_ns, "/lidar_packets", HESAI, hesai_message(sent, sec=BEGIN_NS // SECOND_NS, frame="os_sensor"))
+        )
+    return entries
+
+
+def test_a_recording_of_packets_of_a_hesai(tmp_path: Path) -> None:
+    nominal = write_entries(tmp_path / "nominal.mcap", [*others(), *hesai_turns()])
+    recording = open_source(str(nominal))
+    assert "nominal directions of the lasers of a PandarXT-32" in codes(recording)["nominal_angles"]
+    assert recording.rig.lidar_frame == "os_sensor"
+    sweeps = sweeps_of(recording)
+    assert [len(sweep.xyz_m) for sweep in sweeps] == [64 * 32] * 6
+    stamps_s = [(sweep.stamp_ns - BEGIN_NS) * 1e-9 for sweep in sweeps]
+    np.testing.assert_allclose(stamps_s, HESAI_MIDDLE_S + 0.1 * np.arange(6), atol=1e-5)
+    corrected = open_source(str(write_entries(tmp_path / "corrected.mcap", [CORRECTION, *others(), *hesai_turns()])))
+    assert "nominal_angles" not in codes(corrected)
+    given = tmp_path / "Angle Correction File.csv"
+    given.write_bytes(correction_file(*DIRECTIONS))
+    of_file, of_topic = sweeps_of(open_source(f"{nominal}?metadata={given}")), sweeps_of(corrected)
+    for a, b, plain in zip(of_file, of_topic, sweeps, strict=True):
+        np.testing.assert_array_equal(a.xyz_m, b.xyz_m)
+        assert np.abs(a.xyz_m - plain.xyz_m).max() > 0.01
+
+
+def test_the_clock_of_a_hesai_that_was_never_set_begins_at_2000(tmp_path: Path) -> None:
+    entries = [CORRECTION, *others(), *hesai_turns(sensor_begin_ns=946_684_800 * SECOND_NS + 7 * SECOND_NS)]
+    recording = open_source(str(write_entries(tmp_path / "drive.mcap", entries)))
+    assert "lidar_clock" in codes(recording)
+    stamps_s = [(sweep.stamp_ns - BEGIN_NS) * 1e-9 for sweep in sweeps_of(recording)]
+    # Late by the 2 ms of its reception, and by the time from the last block to the end of the turn.
+    np.testing.assert_allclose(stamps_s, HESAI_MIDDLE_S + 0.002 + 0.1 / 64 + 0.1 * np.arange(6), atol=1e-5)
+
+
 # --- a drive in packets decides as one of points ----------------------------------------------------------------------
 
 SIM = "sim:seed=3&seconds=30&camera_hz=0.5&lidar_hz=0.5&camera=pinhole640x400@90&lidar=32"
@@ -229,11 +290,7 @@ def test_a_drive_in_packets_of_an_ouster_decides_within_one_sigma_of_the_same_dr
 
 
 def ouster_entries(profile: str, sweeps: list[LidarFrame]) -> list[Entry]:
-    sweep = sweeps[0]
-    assert sweep.ring is not None
-    beams = int(max(one.ring.max() for one in sweeps if one.ring is not None)) + 1
-    elevation = np.degrees(np.arcsin(sweep.xyz_m[:, 2] / np.linalg.norm(sweep.xyz_m, axis=1)))
-    altitudes = [float(np.median(elevation[sweep.ring == beam])) for beam in range(beams)]
+    altitudes, beams = elevations_of(sweeps), 32
     # Columns of the simulator begin at the rear, half a step before a column of the sensor.
     azimuths = [-180.0 + 180.0 / COLUMNS] * beams
     sensor = Ouster(profile, COLUMNS, altitudes, azimuths, (0.0, 0.0), in_packet=8)
@@ -246,6 +303,39 @@ def ouster_entries(profile: str, sweeps: list[LidarFrame]) -> list[Entry]:
         sent = sensor.packets(in_mm, intensity, begin_ns, index, SWEEP_NS // COLUMNS)
         entries += [(begin_ns + SWEEP_NS, PACKETS, OUSTER, ouster_message(packet)) for packet in sent]
     return entries
+
+
+@pytest.mark.slow
+def test_a_drive_in_packets_of_a_hesai_decides_within_one_sigma_of_the_same_drive_as_points(
+    tmp_path: Path, record_property: Any
+) -> None:
+    drive = rendered_source(SIM)
+    sweeps = [frame for frame in drive.messages() if isinstance(frame, LidarFrame)]
+    distance = distance_of(tmp_path, drive, hesai_entries(sweeps, drive.rig.lidar_frame))
+    record_property("figure", f"PandarXT-32: {distance:.2f} standard deviations")
+    assert distance < 1.0
+
+
+def hesai_entries(sweeps: list[LidarFrame], frame: str) -> list[Entry]:
+    """The simulated LiDAR as an XT-32, turned by 90°: azimuths count from y."""
+    entries: list[Entry] = []
+    for one in sweeps:
+        ranges, intensity = gridded(one, COLUMNS, 32)
+        begin_ns = one.stamp_ns - SWEEP_NS // 2 + SWEEP_NS // COLUMNS // 2
+        units = np.rint(ranges / 0.004).astype(int)
+        sent = XT32.packets(units, intensity, begin_ns, SWEEP_NS / COLUMNS, 270.0 + 180.0 / COLUMNS)
+        message = hesai_message(sent, sec=one.stamp_ns // SECOND_NS, frame=frame)
+        entries.append((begin_ns + SWEEP_NS, "/lidar_packets", HESAI, message))
+    altitudes = elevations_of(sweeps)
+    return [(0, "/lidar_corrections", messages.BYTES, bytes_message(correction_file(altitudes, [0.0] * 32))), *entries]
+
+
+def elevations_of(sweeps: list[LidarFrame]) -> list[float]:
+    """Of each beam, degrees."""
+    sweep = sweeps[0]
+    assert sweep.ring is not None
+    elevation = np.degrees(np.arcsin(sweep.xyz_m[:, 2] / np.linalg.norm(sweep.xyz_m, axis=1)))
+    return [float(np.median(elevation[sweep.ring == beam])) for beam in range(32)]
 
 
 def distance_of(folder: Path, drive: RecordingSource, in_packets: list[Entry]) -> float:

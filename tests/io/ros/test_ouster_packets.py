@@ -78,7 +78,7 @@ def test_what_a_glimpse_of_each_packet_shows(profile: str) -> None:
     glimpses = [glimpse(message) for message in turn(sensor, frame=65_535)] + [glimpse(ouster_message(bytes(48)))]
     times_ns, numbers = OusterSensor.from_metadata(sensor.metadata()).heads(glimpses)
     assert numbers.tolist() == [65_535] * 4 + [-1]
-    assert times_ns.tolist() == [STAMP_NS + 16 * packet * STEP_NS for packet in range(4)] + [0]
+    assert times_ns[:, 0].tolist() == [STAMP_NS + 16 * packet * STEP_NS for packet in range(4)] + [0]
     with pytest.raises(DecodeError, match=r"no packet has the \d+ bytes that the metadata of the Ouster say"):
         OusterSensor.from_metadata(Ouster(columns=32, in_packet=8).metadata()).heads(glimpses)
 
@@ -115,6 +115,8 @@ def test_metadata_of_old_firmware() -> None:
         (Ouster(altitudes=[]).metadata(), "no metadata of an Ouster"),
         (Ouster(altitudes=[1.0]).metadata(), "more angles than beams"),
         (Ouster(altitudes=[float("nan")] * 4).metadata(), "no metadata of an Ouster"),
+        (Ouster(beam_origin=(1e300, 0.0)).metadata(), "no metadata of an Ouster"),
+        (Ouster().metadata(lidar_intrinsics={"lidar_to_sensor_transform": [2.0] * 16}), "no metadata of an Ouster"),
         (Ouster(columns=10**9).metadata(), "no metadata of an Ouster"),
         (Ouster(in_packet=10**9).metadata(), "no metadata of an Ouster"),
         (Ouster("RNG99").metadata(), r"the profile 'RNG99': LEGACY, .*RNG15_RFL8_NIR8_ZONE16 are read"),

@@ -25,10 +25,9 @@ from coec.config import LimitsConfig, PointTimeConfig, describe
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.io.recordings import packet_streams
 from coec.io.recordings.bag_storage import MAX_MESSAGE_BYTES, BagMessage, BagReader, BagStorage
-from coec.io.recordings.packet_streams import MAX_DESCRIPTION_BYTES, PacketStream, PacketSweep, metadata_of
+from coec.io.recordings.packet_streams import MAX_DESCRIPTION_BYTES, PacketStream, PacketSweep
 from coec.io.ros import camera_info, message_decoding, messages, packed_clouds, point_clouds
 from coec.io.ros import transforms as ros_transforms
-from coec.io.ros.ouster_packets import OusterSensor
 from coec.io.user_files import expand_home
 from coec.io.video import VideoTrack, codec_of
 from coec.schemas.keys import TF_STATIC
@@ -160,7 +159,7 @@ class BagIndex:
         unread: topics of frames in another form, with what they have and what to do.
         transforms_at: places of the messages of all other transforms, by topic, in the order in the bag.
         packets: messages of packets by topic, until `resolve_packets` makes streams of them.
-        metadata: what LiDARs say of themselves, by topic.
+        descriptions: messages in which LiDARs say what they are, by topic.
     """
 
     path: Path
@@ -171,7 +170,7 @@ class BagIndex:
     transforms_at: dict[str, list[tuple[int, ...]]] = field(default_factory=dict)
     unread: dict[str, str] = field(default_factory=dict)
     packets: dict[str, PacketStream] = field(default_factory=dict)
-    metadata: dict[str, bytes] = field(default_factory=dict)
+    descriptions: dict[str, bytes] = field(default_factory=dict)
 
     def topic(self, types: tuple[str, ...], requested: str | None, key: str) -> str:
         """The topic of these types that was asked for, else the only one.
@@ -308,7 +307,7 @@ class BagIndex:
         """
         name = entry.type_name
         if name in packet_streams.TYPES:
-            packets = self.packets.setdefault(entry.topic, PacketStream())
+            packets = self.packets.setdefault(entry.topic, PacketStream(entry.topic, name))
             self._decoded(entry, lambda data: packets.add(data, entry.place, entry.logged_ns))
         elif name in (*IMAGE_TYPES, *CLOUD_TYPES, *VELOCITY_TYPES, *ROTATION_TYPES):
             stream = self.streams.setdefault(entry.topic, TopicStream(name))
@@ -322,9 +321,9 @@ class BagIndex:
                 return
             stream.locations.append(MessageLocation(stamp_ns, entry.place, name, frame_id))
             stream.lags_s.append((entry.logged_ns - stamp_ns) * 1e-9)
-        elif name == messages.STRING and b"beam_altitude_angles" in entry.data[:MAX_DESCRIPTION_BYTES]:
-            if entry.topic in self.metadata or len(self.metadata) < LISTED:
-                self.metadata[entry.topic] = entry.data[entry.data.index(b"{") :].rstrip(b"\0")
+        elif name in (messages.STRING, messages.BYTES) and packet_streams.is_description(entry.data):
+            if entry.topic in self.descriptions or len(self.descriptions) < LISTED:
+                self.descriptions[entry.topic] = entry.data
         elif name == messages.CAMERA_INFO:
             self._decoded(entry, self.infos.setdefault(entry.topic, camera_info.CameraInfos()).add)
         elif name == messages.TF and entry.topic == TF_STATIC:
@@ -341,20 +340,20 @@ class BagIndex:
         topic, if a person says so."""
         for topic, packets in self.packets.items():
             try:
-                sensor = OusterSensor.from_metadata(metadata_of(topic, self.metadata, metadata))
+                sensor = packets.sensor(self.descriptions, metadata)
                 sweeps, notes = packets.sweeps(sensor)
             except DecodeError as error:
                 self._leave_unread(topic, f"packets of a LiDAR: {error}")
                 continue
-            stream = self.streams.setdefault(topic, TopicStream(packet_streams.TYPES[0], notes=notes))
+            stream = self.streams.setdefault(topic, TopicStream(packets.type_name, notes=notes))
             for sweep in sweeps:
                 place = MessageLocation(sweep.stamp_ns, sweep.places[0], stream.type_name, sensor.frame_id, sweep)
                 stream.locations.append(place)
                 stream.lags_s.append((sweep.logged_ns - sweep.stamp_ns) * 1e-9)
-            parent, T_parent_child = sensor.pose
-            if sensor.frame_id not in self.transforms.frames and parent in self.transforms.frames:
+            frames = self.transforms.frames
+            if sensor.pose is not None and sensor.frame_id not in frames and sensor.pose[0] in frames:
                 with suppress(DecodeError):
-                    joint = ros_transforms.StaticTransform(parent, sensor.frame_id, T_parent_child)
+                    joint = ros_transforms.StaticTransform(sensor.pose[0], sensor.frame_id, sensor.pose[1])
                     self.transforms.add((joint,))
 
     def _leave_unread(self, topic: str, text: str) -> None:
@@ -409,7 +408,7 @@ def build_index(storage: BagStorage, clouds: CloudDecoder, metadata: str | None 
     for entry in storage.entries():
         index.add(entry)
     given: bytes | str | None = metadata
-    if metadata is not None and metadata not in index.metadata:
+    if metadata is not None and metadata not in index.descriptions:
         try:
             with expand_home(metadata).open("rb") as file:
                 given = file.read(MAX_DESCRIPTION_BYTES)

@@ -22,11 +22,7 @@ from numpy.typing import NDArray
 from coec.calibration.types import LidarFrame, Matrix4, Recognition
 from coec.errors import DecodeError
 from coec.io.frame_validation import Refusal
-from coec.io.ros import messages, ouster_packets
-from coec.io.ros.point_clouds import SINCE_S
-
-TYPES: Final = messages.OUSTER_PACKETS
-"""Types of the messages that are read."""
+from coec.io.ros import hesai_packets, messages, ouster_packets
 
 MAX_DESCRIPTION_BYTES: Final = 2**20
 """Longest text in which a sensor says what it is; Ouster's has some 10 kB."""
@@ -36,6 +32,9 @@ MAX_PACKETS: Final = 8192
 
 NEIGHBOURS: Final = 100
 """Sweeps before and after a sweep by which its clock is tied to the recorder's: 10 s each at 10 Hz."""
+
+SET_S: Final = 1_262_304_000
+"""Begin of 2010, seconds since 1970. An earlier clock was never set: some sensors begin at 2000."""
 
 RESTART_NS: Final = 1_000_000_000
 """Clocks that differ by more from one sweep to another are those of different starts of the sensor."""
@@ -61,10 +60,40 @@ class PacketSensor(Protocol):
         """What is to be said of the points."""
 
     def heads(self, glimpses: Sequence[bytes]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """(N,) time of each message by the sensor's clock, ns, and (N,) number of its sweep, -1 for something else."""
+        """(N, 2) first and last time of each message by the sensor's clock, ns, and (N,) number of its sweep, -1 for
+        something else."""
 
     def sweep(self, payloads: Sequence[bytes], at_ns: int, stamp_ns: int) -> LidarFrame:
         """The points of some messages; `at_ns` by the sensor's clock is `stamp_ns` of the recording."""
+
+
+class PacketFormat(Protocol):
+    """The packets of a maker: a module, as `ouster_packets`."""
+
+    @property
+    def DESCRIBED(self) -> bytes:
+        """What a text has in which its sensors say what they are."""
+
+    def glimpse(self, payload: bytes) -> bytes:
+        """What the index keeps of a message."""
+
+    def sensor_of(self, glimpses: Sequence[bytes], description: bytes | None, /) -> PacketSensor:
+        """The sensor that sent some messages."""
+
+
+FORMATS: Final[Mapping[str, PacketFormat]] = {
+    **dict.fromkeys(messages.OUSTER_PACKETS, ouster_packets),
+    **dict.fromkeys((messages.HESAI_PACKETS, messages.PANDAR_PACKETS, messages.NEBULA_PACKETS), hesai_packets),
+}
+"""By the type of the messages that are read."""
+
+TYPES: Final = tuple(FORMATS)
+
+
+def is_description(data: bytes) -> bool:
+    """Whether a message of text or bytes is one in which a sensor says what it is."""
+    begin = data[:MAX_DESCRIPTION_BYTES]
+    return any(of_maker.DESCRIBED in begin for of_maker in FORMATS.values())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,8 +123,14 @@ class PacketSweep:
 
 @dataclass(slots=True)
 class PacketStream:
-    """The messages on a topic of packets, in the order in the bag."""
+    """The messages on a topic of packets, in the order in the bag.
 
+    Attributes:
+        topic, type_name: where they came, and their type.
+    """
+
+    topic: str
+    type_name: str
     places: list[tuple[int, ...]] = field(default_factory=list)
     glimpses: list[bytes] = field(default_factory=list)
     logged_ns: array[int] = field(default_factory=lambda: array("q"))
@@ -106,9 +141,32 @@ class PacketStream:
         Raises:
             DecodeError: it is not one.
         """
-        self.glimpses.append(ouster_packets.glimpse(payload))
+        self.glimpses.append(FORMATS[self.type_name].glimpse(payload))
         self.places.append(place)
         self.logged_ns.append(logged_ns)
+
+    def sensor(self, descriptions: Mapping[str, bytes], given: bytes | str | None) -> PacketSensor:
+        """The sensor.
+
+        Args:
+            descriptions: messages in which sensors say what they are, by topic.
+            given: such a text, or its topic, if a person says so.
+
+        Raises:
+            DecodeError: nothing says what it is, or several; or its packets are not read.
+        """
+        if not self.glimpses:
+            raise DecodeError(Refusal.MESSAGE_MALFORMED, "there are no packets")
+        of_maker = FORMATS[self.type_name]
+        if isinstance(given, bytes):
+            return of_maker.sensor_of(self.glimpses, given)
+        known = {topic: text for topic, text in descriptions.items() if of_maker.DESCRIBED in text}
+        adjacent = [name for name in known if name.rpartition("/")[0] == self.topic.rpartition("/")[0]]
+        selected = [given] if given is not None else adjacent or list(known)
+        if len(selected) > 1:
+            text = f"several topics say what the LiDAR is, {', '.join(selected)}: choose with ?metadata=/TOPIC"
+            raise DecodeError(Refusal.MESSAGE_TYPE, text)
+        return of_maker.sensor_of(self.glimpses, known.get(selected[0]) if selected else None)
 
     def sweeps(self, sensor: PacketSensor) -> tuple[list[PacketSweep], tuple[Recognition, ...]]:
         """The sweeps, and what to tell of them.
@@ -118,6 +176,8 @@ class PacketStream:
         """
         times_ns, numbers = sensor.heads(self.glimpses)
         groups = [np.array(group) for group in _grouped(numbers)]
+        if not groups:
+            raise DecodeError(Refusal.MESSAGE_MALFORMED, "no message has packets of points of this sensor")
         usual = float(np.median([len(group) for group in groups]))
         for end in (0, -1):
             if len(groups) > 1 and len(groups[end]) < WHOLE * usual:
@@ -125,7 +185,7 @@ class PacketStream:
         middles_ns = np.array([_middle(times_ns[group]) for group in groups])
         logged_ns = np.frombuffer(self.logged_ns, np.int64)[[group[len(group) // 2] for group in groups]]
         stamps_ns, notes = middles_ns, sensor.notes
-        if np.median(middles_ns) < SINCE_S * 1e9:
+        if np.median(middles_ns) < SET_S * 1e9:
             stamps_ns = middles_ns + _ahead_ns(np.array([self._lag_ns(group, times_ns[group]) for group in groups]))
             notes = (*notes, _FREE_RUNNING)
         other = int((numbers < 0).sum())
@@ -140,9 +200,10 @@ class PacketStream:
         return sweeps, notes
 
     def _lag_ns(self, group: NDArray[np.int64], times_ns: NDArray[np.int64]) -> int:
-        """Least time from the end of a packet of a sweep until it was received."""
-        lasts_ns = int(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 0
-        return int((np.frombuffer(self.logged_ns, np.int64)[group] - times_ns).min()) - lasts_ns
+        """Least time from the end of a message of a sweep until it was received. One of which only the first time is
+        known lasts until the next one."""
+        lasts_ns = int(np.median(times_ns[1:, 0] - times_ns[:-1, 1])) if len(times_ns) > 1 else 0
+        return int((np.frombuffer(self.logged_ns, np.int64)[group] - times_ns[:, 1]).min()) - lasts_ns
 
 
 _FREE_RUNNING: Final = Recognition(
@@ -186,28 +247,3 @@ def _ahead_ns(lags_ns: NDArray[np.int64]) -> NDArray[np.int64]:
             same_start = np.abs(lags_ns[near] - lags_ns[at]) < RESTART_NS
             np.minimum(ahead_ns[at], lags_ns[near], out=ahead_ns[at], where=same_start)
     return ahead_ns
-
-
-def metadata_of(topic: str, known: Mapping[str, bytes], given: bytes | str | None) -> bytes:
-    """What the sensor of a topic says of itself.
-
-    Args:
-        topic: of the packets.
-        known: such texts by topic.
-        given: the text, or its topic, if a person says so.
-
-    Raises:
-        DecodeError: `message_type`: there is none, or several.
-    """
-    if isinstance(given, bytes):
-        return given
-    adjacent = [name for name in known if name.rpartition("/")[0] == topic.rpartition("/")[0]]
-    selected = [given] if given is not None else adjacent or list(known)
-    if len(selected) == 1 and selected[0] in known:
-        return known[selected[0]]
-    if not known:
-        raise DecodeError(Refusal.MESSAGE_TYPE, ouster_packets.MISSING)
-    raise DecodeError(
-        Refusal.MESSAGE_TYPE,
-        f"the recording has the metadata of an Ouster on {', '.join(known)}: choose with ?metadata=/TOPIC",
-    )

@@ -327,8 +327,7 @@ _PACKED: Final = f"packed clouds are read from recordings only: {packed_clouds.U
 _PACKETS: Final = (
     "packets of the LiDAR are no points: take the topic of PointCloud2 of its driver, or convert them with "
 )
-_OUSTER: Final = "packets of a LiDAR are read from recordings only: take the topic of PointCloud2 of ouster_ros"
-_HESAI: Final = f"{_PACKETS}hesai_ros_driver, `source_type: 3` in its config.yaml (packets from a bag)"
+_RECORDED: Final = "packets of a LiDAR are read from recordings only: take the topic of PointCloud2 of "
 
 REFUSED: Final = {
     messages.FFMPEG_PACKET: _VIDEO,
@@ -336,9 +335,11 @@ REFUSED: Final = {
     messages.FOXGLOVE_CLOUD: _PACKED,
     "theora_image_transport/msg/Packet": _VIDEO,
     messages.VELODYNE_SCAN: f"{_PACKETS}velodyne_pointcloud (velodyne_transform_node)",
-    **dict.fromkeys(messages.OUSTER_PACKETS, _OUSTER),
-    "hesai_ros_driver/msg/UdpFrame": _HESAI,
-    "pandar_msgs/msg/PandarScan": f"{_PACKETS}the driver of Hesai or nebula_ros",
+    **dict.fromkeys(messages.OUSTER_PACKETS, f"{_RECORDED}ouster_ros"),
+    **dict.fromkeys(
+        (messages.HESAI_PACKETS, messages.PANDAR_PACKETS, messages.NEBULA_PACKETS),
+        f"{_RECORDED}hesai_ros_driver or nebula_ros",
+    ),
     "rslidar_msg/msg/RslidarPacket": f"{_PACKETS}rslidar_sdk, `msg_source: 2` in its config.yaml (packets from ROS)",
     messages.COMPRESSED_CLOUD: _PACKED,
     "sensor_msgs/msg/PointCloud": "PointCloud has been replaced by PointCloud2: convert it (point_cloud_converter)",

@@ -30,7 +30,11 @@ VELODYNE_SCAN: Final = "velodyne_msgs/msg/VelodyneScan"
 OUSTER_PACKETS: Final = tuple(
     f"{package}/msg/PacketMsg" for package in ("ouster_sensor_msgs", "ouster_msgs", "ouster_ros")
 )
+HESAI_PACKETS: Final = "hesai_ros_driver/msg/UdpFrame"
+PANDAR_PACKETS: Final = "pandar_msgs/msg/PandarScan"
+NEBULA_PACKETS: Final = "nebula_msgs/msg/NebulaPackets"
 STRING: Final = "std_msgs/msg/String"
+BYTES: Final = "std_msgs/msg/UInt8MultiArray"
 COMPRESSED_CLOUD: Final = "point_cloud_interfaces/msg/CompressedPointCloud2"
 FOXGLOVE_CLOUD: Final = "foxglove_msgs/msg/CompressedPointCloud"
 
@@ -39,6 +43,8 @@ _DEFINITIONS: Final = {
     "bool is_bigendian\nuint8[] data\n",
     "velodyne_msgs/msg/VelodynePacket": "builtin_interfaces/Time stamp\nuint8[1206] data\n",
     VELODYNE_SCAN: "std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets\n",
+    "nebula_msgs/msg/NebulaPacket": "builtin_interfaces/Time stamp\nuint8[] data\n",
+    NEBULA_PACKETS: "std_msgs/Header header\nnebula_msgs/NebulaPacket[] packets\n",
     **dict.fromkeys(OUSTER_PACKETS, "uint8[] buf\n"),
     COMPRESSED_CLOUD: "std_msgs/Header header\nuint32 height\nuint32 width\nsensor_msgs/PointField[] fields\n"
     "bool is_bigendian\nuint32 point_step\nuint32 row_step\nuint8[] compressed_data\nbool is_dense\nstring format\n",
@@ -167,6 +173,10 @@ class MessageCursor:
             raise DecodeError(Refusal.MESSAGE_MALFORMED, "the message ends within its head") from error
         self._at += 4
         return int(value)
+
+    def place(self) -> int:
+        """Where the next uint32 stands in the message."""
+        return self._at + -(self._at - _ENCAPSULATION) % 4
 
     def skip(self, size: int) -> None:
         """Skips `size` bytes."""

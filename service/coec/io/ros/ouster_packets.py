@@ -25,6 +25,9 @@ from coec.errors import DecodeError
 from coec.io.frame_validation import Refusal, lidar_frame
 from coec.io.ros.messages import MessageCursor
 
+DESCRIBED: Final = b"beam_altitude_angles"
+"""What metadata have in their text."""
+
 MISSING: Final = (
     "the recording has packets of an Ouster, but no metadata: record the topic `metadata` beside that of the packets, "
     "too, or give ?metadata=FILE (the JSON that ouster_ros or Ouster Studio saves)"
@@ -35,6 +38,9 @@ MAX_BEAMS, MAX_COLUMNS, MAX_PACKET_COLUMNS = 256, 8192, 128
 
 MAX_SWEEP_BYTES: Final = 2**24
 """Most bytes of the packets of a sweep. The largest has 8.4 MB: 4096 columns of 128 beams with 16 bytes a pixel."""
+
+MAX_NUMBER: Final = 1e6
+"""Largest number of the metadata that is used: a kilometre."""
 
 _GLIMPSE: Final = 48
 """Bytes of a packet that the index keeps: the packet's header and that of its first column."""
@@ -92,6 +98,18 @@ def _packet(payload: bytes) -> memoryview:
     return memoryview(payload)[8 : 8 + size]
 
 
+def sensor_of(glimpses: Sequence[bytes], metadata: bytes | None) -> OusterSensor:
+    """The sensor that these describe, which sent some packets.
+
+    Raises:
+        DecodeError: `message_type`: there are no metadata; or as `OusterSensor.from_metadata`.
+    """
+    del glimpses
+    if metadata is None:
+        raise DecodeError(Refusal.MESSAGE_TYPE, MISSING)
+    return OusterSensor.from_metadata(metadata[max(metadata.find(b"{"), 0) :].rstrip(b"\0"))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class OusterSensor:
     """A sensor, as its metadata describe it.
@@ -126,12 +144,14 @@ class OusterSensor:
             values = {name: value for section in reversed(sections) for name, value in section.items()}
             altitude_deg = _numbers(values["beam_altitude_angles"], MAX_BEAMS)
             azimuth_deg = _numbers(values["beam_azimuth_angles"], MAX_BEAMS)
-            origin_mm = (float(values.get("lidar_origin_to_beam_origin_mm", 0.0)), 0.0)
+            origin_mm = (float(_numbers([values.get("lidar_origin_to_beam_origin_mm", 0.0)], 1)[0]), 0.0)
             if "beam_to_lidar_transform" in values:
                 T = _numbers(values["beam_to_lidar_transform"], 16).reshape(4, 4)
                 origin_mm = (float(T[0, 3]), float(T[2, 3]))
             T_sensor_lidar = _numbers(values["lidar_to_sensor_transform"], 16).reshape(4, 4).copy()
             T_sensor_lidar[:3, 3] *= 1e-3
+            if not np.allclose(T_sensor_lidar[:3, :3] @ T_sensor_lidar[:3, :3].T, np.eye(3), atol=1e-3):
+                raise ValueError("no rotation")
             profile, packet, columns = _layout(values, len(altitude_deg))
         except (KeyError, TypeError, ValueError, AttributeError, RecursionError, OverflowError) as error:
             what = f" (no {error})" if isinstance(error, KeyError) else ""
@@ -161,8 +181,7 @@ class OusterSensor:
         return (Recognition("coarse_ranges", text),)
 
     def heads(self, glimpses: Sequence[bytes]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """(N,) time of the first column of each packet by the sensor's clock, ns, and (N,) number of its sweep, -1 for
-        a packet of something else.
+        """See `PacketSensor`; of a packet, only the time of the first column is known.
 
         Raises:
             DecodeError: `message_malformed`: no packet has the size that the metadata say.
@@ -181,9 +200,9 @@ class OusterSensor:
         heads = heads.reshape(-1, _GLIMPSE)
         time_at = self.packet.fields["columns"][1]  # type: ignore[index]
         frame, frame_at = self.packet.fields["frame"][:2]  # type: ignore[index]
-        times_ns, numbers = np.zeros(len(known), np.int64), np.full(len(known), -1, np.int64)
+        times_ns, numbers = np.zeros((len(known), 2), np.int64), np.full(len(known), -1, np.int64)
         times = np.ascontiguousarray(heads[:, time_at : time_at + 8]).view("<u8")[:, 0]
-        times_ns[known] = np.minimum(times, np.uint64(2**62)).astype(np.int64)
+        times_ns[known] = np.minimum(times, np.uint64(2**62)).astype(np.int64)[:, None]
         numbers[known] = np.ascontiguousarray(heads[:, frame_at : frame_at + frame.itemsize]).view(frame)[:, 0]
         return times_ns, numbers
 
@@ -223,12 +242,12 @@ class OusterSensor:
 
 
 def _numbers(values: Any, most: int) -> NDArray[np.float64]:
-    """A list of finite numbers."""
+    """A list of numbers: angles in degrees, lengths in millimetres."""
     if not isinstance(values, list) or not 0 < len(values) <= most:
         raise ValueError("not as many numbers as expected")
     numbers = np.array([float(value) for value in values])
-    if not np.isfinite(numbers).all():
-        raise ValueError("not finite")
+    if not (np.abs(numbers) <= MAX_NUMBER).all():
+        raise ValueError("not finite, or out of range")
     return numbers
 
 

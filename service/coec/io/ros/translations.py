@@ -20,7 +20,7 @@ from rosbags.typesys.stores import ros2_humble as ros
 
 from coec.errors import DecodeError
 from coec.io.frame_validation import Refusal
-from coec.io.ros import messages, point_clouds
+from coec.io.ros import hesai_packets, messages, point_clouds
 
 MAX_JSON_BYTES: Final = 64 * 2**20
 """Largest message in JSON: an image of 32 MiB has 43 MiB in base64."""
@@ -72,7 +72,9 @@ _LIVOX: Final = Translation(
 def _ros_1() -> dict[tuple[str, str], Translation]:
     known = {name: name for name in messages.known_types() if "/msg/" in name} | {"tf/msg/tfMessage": messages.TF}
     livox = {("ros1", "livox_ros_driver/CustomMsg"): _LIVOX, ("ros1", "livox_ros_driver2/CustomMsg"): _LIVOX}
-    return livox | {
+    hesai = Translation(messages.NEBULA_PACKETS, hesai_packets.cdr_of_ros_1)
+    packets = {("ros1", "pandar_msgs/PandarScan"): hesai, ("ros1", "hesai_ros_driver/UdpFrame"): hesai}
+    return (livox | packets) | {
         ("ros1", name.replace("/msg/", "/")): Translation(of_ros_2, _from_ros_1(of_ros_2))
         for name, of_ros_2 in known.items()
     }
