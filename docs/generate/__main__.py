@@ -12,12 +12,14 @@ from pathlib import Path
 from generate.commands import commands_page, python_page
 from generate.configuration import configuration_page
 from generate.contract import keys_page, schemas_page
+from generate.formats import formats_page
 from generate.service import figures_page, health_page, metrics_page, operations_page
 
 PAGES: Mapping[str, Callable[[], str]] = {
     "cli.md": commands_page,
     "configuration.md": configuration_page,
     "figures.md": figures_page,
+    "formats.md": formats_page,
     "health.md": health_page,
     "keys.md": keys_page,
     "metrics.md": metrics_page,

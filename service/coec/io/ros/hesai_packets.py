@@ -47,7 +47,7 @@ CORRECTIONS: Final = (
 
 
 @dataclass(frozen=True, slots=True)
-class _Model:
+class Model:
     """How a model packs its returns, and how they are timed.
 
     Attributes:
@@ -136,11 +136,31 @@ _AZIMUTHS_QT: Final = (
     -7.163, -7.493, -7.892,
 )  # fmt: skip
 
-_PANDAR_40P: Final = _Model("Pandar40P", 40, 10, 0, 4, 3, 14, 16, 10, -57.6, _STEP_40_US, _ELEVATIONS_40, _AZIMUTHS_40)
-_PANDAR_64: Final = _Model("Pandar64", 64, 6, 8, 2, 3, 14, 16, 10, -71.6, _STEP_40_US, _ELEVATIONS_64, _AZIMUTHS_64)
-_PANDAR_QT: Final = _Model("PandarQT", 64, 4, 12, 2, 4, 16, 18, 12, 105.1, 166.7, _ELEVATIONS_QT, _AZIMUTHS_QT)
+_PANDAR_40P: Final = Model("Pandar40P", 40, 10, 0, 4, 3, 14, 16, 10, -57.6, _STEP_40_US, _ELEVATIONS_40, _AZIMUTHS_40)
+_PANDAR_64: Final = Model("Pandar64", 64, 6, 8, 2, 3, 14, 16, 10, -71.6, _STEP_40_US, _ELEVATIONS_64, _AZIMUTHS_64)
+_PANDAR_QT: Final = Model("PandarQT", 64, 4, 12, 2, 4, 16, 18, 12, 105.1, 166.7, _ELEVATIONS_QT, _AZIMUTHS_QT)
 
-_UNREAD: Final = {
+
+def _xt(name: str, lasers: int, blocks: int, top: float, step: float) -> Model:
+    elevations = tuple(top - step * laser for laser in range(lasers))
+    return Model(name, lasers, blocks, 12, 2, 4, 10, 13, 19, 29.0, 50.0, elevations, (0.0,) * lasers)
+
+
+_WITH_HEADER: Final = {
+    (3, 1, 64, 4): _PANDAR_QT,
+    (6, 1, 16, 8): _xt("PandarXT-16", 16, 8, 15.0, 2.0),
+    (6, 1, 32, 8): _xt("PandarXT-32", 32, 8, 15.0, 1.0),
+    (6, 1, 32, 6): _xt("PandarXTM", 32, 6, 19.5, 1.3),
+}
+"""By version of the protocol, lasers and blocks."""
+
+PLATFORM_128: Final = "Pandar128"
+"""Models of the protocol 1.4, with up to 128 lasers: Pandar128, OT128, Pandar40E3X, 64E3X, 90E3X. No nominal table."""
+
+MODELS: Final = (_PANDAR_40P, _PANDAR_64, *_WITH_HEADER.values())
+"""The models whose directions are known."""
+
+UNREAD: Final = {
     (1, 8): "JT16",
     (2, 4): "ET25",
     (2, 5): "ET25",
@@ -152,13 +172,13 @@ _UNREAD: Final = {
     (4, 7): "ATX",
     (7, 2): "FT120",
 }
-"""By version of the protocol."""
+"""Models that are not read, by version of the protocol."""
 
 _MODES: Final = {0x39: 2, 0x3A: 2, 0x3B: 2, 0x3C: 2, 0x3D: 3}
 """Returns of a shot, each a block, by the return mode; one for any other."""
 
 
-def _model_of(packet: bytes | memoryview) -> _Model:
+def _model_of(packet: bytes | memoryview) -> Model:
     """The model that sent a packet, by its size and beginning.
 
     Raises:
@@ -176,20 +196,18 @@ def _model_of(packet: bytes | memoryview) -> _Model:
 
 
 @functools.lru_cache(maxsize=256)
-def _by_header(begin: bytes) -> _Model:
+def _by_header(begin: bytes) -> Model:
     lasers, blocks, flags = begin[6], begin[7], begin[11]
+    model = _WITH_HEADER.get((begin[2], begin[3], lasers, blocks))
+    if model is not None:
+        return model
     match begin[2], begin[3]:
-        case (3, 1) if (lasers, blocks) == (64, 4):
-            return _PANDAR_QT
-        case (6, 1) if (lasers, blocks) in ((16, 8), (32, 8), (32, 6)):
-            top, step, name = (15.0, 32.0 / lasers, f"PandarXT-{lasers}") if blocks == 8 else (19.5, 1.3, "PandarXTM")
-            elevations = tuple(top - step * laser for laser in range(lasers))
-            return _Model(name, lasers, blocks, 12, 2, 4, 10, 13, 19, 29.0, 50.0, elevations, (0.0,) * lasers)
         case (1, 4) if 0 < lasers <= 128 and 0 < blocks <= 4:
             unit, tail = (4 if flags & 0x10 else 3), (21 if flags & 0x04 else 4)
-            return _Model("Pandar128", lasers, blocks, 12, 2, unit, tail + 12, tail + 15, tail + 21, 27.0, _STEP_40_US)
+            places = (tail + 12, tail + 15, tail + 21)
+            return Model(PLATFORM_128, lasers, blocks, 12, 2, unit, *places, 27.0, _STEP_40_US)
         case version:
-            name = _UNREAD.get(version, f"of the protocol {version[0]}.{version[1]}")
+            name = UNREAD.get(version, f"of the protocol {version[0]}.{version[1]}")
             text = (
                 f"packets of a Hesai {name} are not read: let hesai_ros_driver or nebula_ros convert them, and take "
                 "the topic of PointCloud2"
@@ -317,7 +335,7 @@ def sensor_of(glimpses: Sequence[bytes], correction: bytes | None) -> HesaiSenso
     return HesaiSensor(frame, model, np.radians(model.elevations), np.radians(model.azimuths), is_nominal=True)
 
 
-def _corrections(text: bytes, model: _Model) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _corrections(text: bytes, model: Model) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(lasers,) elevations and azimuths, radians, from lines `laser,elevation,azimuth`."""
     angles_deg = np.full((model.lasers, 2), np.nan)
     for line in text.decode(errors="replace").splitlines():
@@ -344,7 +362,7 @@ class HesaiSensor:
     """
 
     frame_id: str
-    model: _Model
+    model: Model
     elevation_rad: NDArray[np.float64]
     azimuth_rad: NDArray[np.float64]
     is_nominal: bool

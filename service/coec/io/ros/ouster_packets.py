@@ -49,7 +49,7 @@ _SIGNAL: Final = "<u2"
 
 
 @dataclass(frozen=True, slots=True)
-class _Profile:
+class Profile:
     """How the pixel of a beam is packed: its bytes; the bits of the range, which begin at the first byte; type and
     place of the intensity."""
 
@@ -63,20 +63,20 @@ class _Profile:
         return 0.008 if self.range_bits == 15 else 0.001
 
 
-_PROFILES: Final[Mapping[str, _Profile]] = {
-    "LEGACY": _Profile(12, 20, (_SIGNAL, 6)),
-    "RNG19_RFL8_SIG16_NIR16": _Profile(12, 19, (_SIGNAL, 6)),
-    "RNG19_RFL8_SIG16_NIR16_DUAL": _Profile(16, 19, (_SIGNAL, 8)),
-    "RNG19_RFL8_SIG16_NIR16_ZONE16": _Profile(12, 19, (_SIGNAL, 6)),
-    "RNG19_RFL8_SIG16_ZONE16_DUAL": _Profile(16, 19, (_SIGNAL, 8)),
-    "RNG19_RFL8_SIG16_NIR16_RGB16": _Profile(16, 19, (_SIGNAL, 4)),
-    "RNG19_RFL8_SIG16_NIR16_RGB16_DUAL": _Profile(20, 19, (_SIGNAL, 8)),
-    "FIVE_WORD_PIXEL": _Profile(20, 19, (_SIGNAL, 8)),
-    "RNG15_RFL8_NIR8": _Profile(4, 15, ("u1", 2)),
-    "RNG15_RFL8_WIN8": _Profile(4, 15, ("u1", 2)),
-    "RNG15_RFL8_NIR8_DUAL": _Profile(8, 15, ("u1", 2)),
-    "FUSA_RNG15_RFL8_NIR8_DUAL": _Profile(8, 15, ("u1", 2)),
-    "RNG15_RFL8_NIR8_ZONE16": _Profile(8, 15, ("u1", 2)),
+PROFILES: Final[Mapping[str, Profile]] = {
+    "LEGACY": Profile(12, 20, (_SIGNAL, 6)),
+    "RNG19_RFL8_SIG16_NIR16": Profile(12, 19, (_SIGNAL, 6)),
+    "RNG19_RFL8_SIG16_NIR16_DUAL": Profile(16, 19, (_SIGNAL, 8)),
+    "RNG19_RFL8_SIG16_NIR16_ZONE16": Profile(12, 19, (_SIGNAL, 6)),
+    "RNG19_RFL8_SIG16_ZONE16_DUAL": Profile(16, 19, (_SIGNAL, 8)),
+    "RNG19_RFL8_SIG16_NIR16_RGB16": Profile(16, 19, (_SIGNAL, 4)),
+    "RNG19_RFL8_SIG16_NIR16_RGB16_DUAL": Profile(20, 19, (_SIGNAL, 8)),
+    "FIVE_WORD_PIXEL": Profile(20, 19, (_SIGNAL, 8)),
+    "RNG15_RFL8_NIR8": Profile(4, 15, ("u1", 2)),
+    "RNG15_RFL8_WIN8": Profile(4, 15, ("u1", 2)),
+    "RNG15_RFL8_NIR8_DUAL": Profile(8, 15, ("u1", 2)),
+    "FUSA_RNG15_RFL8_NIR8_DUAL": Profile(8, 15, ("u1", 2)),
+    "RNG15_RFL8_NIR8_ZONE16": Profile(8, 15, ("u1", 2)),
 }
 """By `udp_profile_lidar`. Profiles of 15 bits have no signal; their reflectivity is the intensity."""
 
@@ -175,7 +175,7 @@ class OusterSensor:
     @property
     def notes(self) -> tuple[Recognition, ...]:
         """What is to be said of the points."""
-        if _PROFILES[self.profile].range_bits != 15:
+        if PROFILES[self.profile].range_bits != 15:
             return ()
         text = f"The packets of the LiDAR ({self.profile}) have ranges in steps of 8 mm, and no signal."
         return (Recognition("coarse_ranges", text),)
@@ -223,12 +223,12 @@ class OusterSensor:
         columns = np.frombuffer(b"".join(packets), self.packet)["columns"].ravel()
         columns = columns[(columns["status"] & 1 == 1) & (columns["number"] < self.columns)]
         pixels = columns["pixels"]
-        ranges = pixels["range"] & (2 ** _PROFILES[self.profile].range_bits - 1)
+        ranges = pixels["range"] & (2 ** PROFILES[self.profile].range_bits - 1)
         column, beam = np.nonzero(ranges)
         x_m, z_m = self.beam_origin_m
         turned_rad = 2.0 * np.pi * (1.0 - columns["number"].astype(np.float64) / self.columns)
         azimuth_rad = turned_rad[column] - self.azimuth_rad[beam]
-        along_m = ranges[column, beam] * _PROFILES[self.profile].range_m - np.hypot(x_m, z_m)
+        along_m = ranges[column, beam] * PROFILES[self.profile].range_m - np.hypot(x_m, z_m)
         level_m = along_m * np.cos(self.altitude_rad)[beam]
         xyz_m = np.empty((len(beam), 3), np.float32)
         xyz_m[:, 0] = level_m * np.cos(azimuth_rad) + x_m * np.cos(turned_rad)[column]
@@ -262,8 +262,8 @@ def _layout(values: Mapping[str, Any], beams: int) -> tuple[str, np.dtype[Any], 
         form = {"columns_per_frame": 0 if mode is None else int(mode[1])}
     profile = str(form.get("udp_profile_lidar", "LEGACY"))
     in_packet, columns = int(form.get("columns_per_packet", 16)), int(form["columns_per_frame"])
-    if profile not in _PROFILES:
-        known = ", ".join(_PROFILES)
+    if profile not in PROFILES:
+        known = ", ".join(PROFILES)
         text = f"packets of an Ouster with the profile {profile[:64]!a}: {known} are read"
         raise DecodeError(Refusal.MESSAGE_TYPE, text)
     if int(form.get("pixels_per_column", beams)) != beams:
@@ -272,7 +272,7 @@ def _layout(values: Mapping[str, Any], beams: int) -> tuple[str, np.dtype[Any], 
         raise ValueError("impossible columns")
     legacy, safe = profile == "LEGACY", form.get("header_type") == "FUSA"
     head, tail = (16, 4) if legacy else (12, 0)
-    pixel = _PROFILES[profile]
+    pixel = PROFILES[profile]
     pixels = np.dtype(
         {
             "names": ["range", "intensity"],

@@ -70,14 +70,14 @@ def _of_transport(payload: bytes, limits: LimitsConfig) -> PointCloud2:
         raise DecodeError(Refusal.CLOUD_TOO_LARGE, text)
     form, packed = str(message.format).strip().lower(), message.compressed_data.tobytes()
     fields, row_step = message.fields, message.row_step
-    if form not in ("draco", *_FORMATS):
-        known = ", ".join(("draco", *_FORMATS))
+    if form not in ("draco", *FORMATS):
+        known = ", ".join(("draco", *FORMATS))
         text = f"a cloud of the format {str(message.format)[:MAX_NAME]!a}: {known} are read; or {UNPACK}"
         raise DecodeError(Refusal.MESSAGE_TYPE, text)
     if form == "draco":
         data, fields = _interleaved(_draco_columns(packed, count), message)
     else:
-        data = np.frombuffer(_FORMATS[form](packed, size), np.uint8)
+        data = np.frombuffer(FORMATS[form](packed, size), np.uint8)
     if form in ("draco", "cloudini"):
         row_step = message.width * step
     return PointCloud2(
@@ -127,11 +127,12 @@ def _of_cloudini(packed: bytes, size: int) -> bytes:
         raise _malformed(f"the cloud packed by Cloudini is damaged: {error}") from error
 
 
-_FORMATS: Final[Mapping[str, Callable[[bytes, int], bytes]]] = {
+FORMATS: Final[Mapping[str, Callable[[bytes, int], bytes]]] = {
     "zlib": _of_zlib,
     "zstd": _of_zstd,
     "cloudini": _of_cloudini,
 }
+"""Decoders by the `format` of a message, beside `draco`."""
 
 # --- Draco ------------------------------------------------------------------------------------------------------------
 

@@ -342,13 +342,14 @@ def _json(data: bytes, _: Fields) -> dict[str, Any]:
         raise _malformed("the data of a message in JSON is not base64") from error
 
 
-_BY_SCHEMA: Final = {
+BY_SCHEMA: Final = {
     **_ros_1(),
     **{("protobuf", schema): _from_foxglove(schema, _protobuf) for schema in _FOXGLOVE},
     **{("json", schema): _from_foxglove(schema, _json) for schema in _FOXGLOVE},
 }
+"""Every translation, by the encoding and the schema of a channel."""
 
-TRANSLATIONS: Final = tuple(_BY_SCHEMA.values())
+TRANSLATIONS: Final = tuple(BY_SCHEMA.values())
 """Every translation, by its number."""
 
-_NUMBERS: Final = {schema: number for number, schema in enumerate(_BY_SCHEMA)}
+_NUMBERS: Final = {schema: number for number, schema in enumerate(BY_SCHEMA)}
