@@ -60,7 +60,7 @@ def test_six_degrees_of_freedom(street: Window, stereo: DepthModel) -> None:
 
 
 def test_a_single_frame_gives_a_rotation(sharp_street: Window, stereo: DepthModel) -> None:
-    """What frames have in common is no question of one; where shifts are searched, too, one view has to say more."""
+    """Where shifts are searched, too, what all frames have in common has to fit by itself."""
     one = replace(sharp_street, pairs=sharp_street.pairs[4:5])
     estimate = solve(from_start(one, 6, -5, 4), stereo, CalibrationConfig())
     assert estimate.verdict.decision is Decision.ACCEPTED

@@ -26,6 +26,7 @@ def posterior(of_lens: float) -> Posterior:
             hypothesis(LENS_OFF, of_lens, [0.05, -0.02, 0.04, 0.01], [0.01, 0.02, 0.005, 0.01]),
         ),
         0.2,
+        20.0,
     )
 
 
@@ -55,4 +56,4 @@ def test_a_lens_that_is_as_given_stays_so_whatever_the_free_one_is() -> None:
 
 def test_without_a_posterior_there_is_no_lens() -> None:
     assert estimate_lens(None, CAMERA) is None
-    assert estimate_lens(Posterior((hypothesis(NOMINAL, 1.0, [0.0] * 4, [0.0] * 4),), 0.2), CAMERA) is None
+    assert estimate_lens(Posterior((hypothesis(NOMINAL, 1.0, [0.0] * 4, [0.0] * 4),), 0.2, 20.0), CAMERA) is None

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.figures import FIGURES
 from coec.calibration.objective.edges import IndependentSamples
+from coec.calibration.objective.fused import Scale
 from coec.calibration.objective.landscape import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.search.change_point import ChangePoint
@@ -28,6 +29,7 @@ from coec.calibration.verdict import (
     judge,
     repetition_metric,
     shape_metrics,
+    sharp_contrast,
 )
 from coec.config import VerdictConfig
 from coec.geometry import se3
@@ -48,6 +50,12 @@ OUTSTANDING = (
     Metric("edge_contrast", 9.0, LIMITS.min_edge_contrast, at_least=True),
     Metric("runner_up", 0.5, LIMITS.max_runner_up, at_least=False),
 )
+
+
+def posterior_of(significance: float = 20.0, **probabilities: float) -> Posterior:
+    """Hypotheses by name, with their probabilities."""
+    every = tuple(Hypothesis(name, p, np.zeros(13), np.eye(13)) for name, p in probabilities.items())
+    return Posterior(every, 0.1, significance)
 
 
 def verdict_on(
@@ -180,6 +188,14 @@ def test_an_objective_without_edges_has_none_to_count_once() -> None:
     assert repetition_metric(None, LIMITS) == ()
 
 
+def test_the_sharpest_edges_count_where_lens_and_held_centre_are_most_probable() -> None:
+    """A held centre that is off by a centimetre displaces near edges by more than they are wide."""
+    at_optimum, scale = replace(GOOD, edge_contrast=4.0), Scale(mean=1.0, deviation=2.0)
+    assert sharp_contrast(at_optimum, scale, posterior_of(significance=17.0, nominal=1.0)) == 8.0
+    assert sharp_contrast(at_optimum, scale, posterior_of(significance=5.0, nominal=1.0)) == 4.0
+    assert sharp_contrast(at_optimum, None, None) == 4.0
+
+
 def changed(gain: float = 9.0, turn_deg: float = 1.0, support: float = 8.0, likeness: float = 0.9) -> ChangePoint:
     after = se3.perturbation(np.radians([turn_deg, 0.0, 0.0, 0.0, 0.0, 0.0]))
     return ChangePoint(3, np.eye(4), after, gain, support, likeness)
@@ -215,11 +231,6 @@ def test_a_knock_within_the_window_refuses_it_and_says_when() -> None:
 )
 def test_what_is_no_knock_does_not_refuse(change: ChangePoint | None) -> None:
     assert verdict_after(change).decision is Decision.ACCEPTED
-
-
-def posterior_of(**probabilities: float) -> Posterior:
-    """Hypotheses by name, with their probabilities."""
-    return Posterior(tuple(Hypothesis(name, p, np.zeros(13), np.eye(13)) for name, p in probabilities.items()), 0.1)
 
 
 @pytest.mark.parametrize(

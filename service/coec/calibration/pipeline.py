@@ -48,7 +48,9 @@ def estimate_of(result: EstimatorResult, data: WindowData, config: CalibrationCo
     pose, curvature = optimum.search.T_camera_lidar, optimum.curvature
     evaluation = result.objective.evaluate(pose)
     change = None if result.edges is None else change_point(result.edges, pose)
-    metrics = verdict.optimum_metrics(result.metrics, evaluation, optimum, change, window.pairs, config)
+    metrics = verdict.optimum_metrics(
+        result.metrics, evaluation, result.edge_scale, optimum, change, window.pairs, config
+    )
     moved = None
     if result.edges is not None and change is not None and any(m.name == MOVED and not m.passed for m in metrics):
         moved = moved_within(change, result.edges, data)

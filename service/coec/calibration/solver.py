@@ -16,7 +16,7 @@ from coec.calibration.frames.motion_compensation import EVERY, Choice, compensat
 from coec.calibration.frames.sweep_evidence import stands
 from coec.calibration.objective import mutual_information
 from coec.calibration.objective.edges import EdgeCue, build_edges, independent_samples_at
-from coec.calibration.objective.fused import FusedObjective, Fusion
+from coec.calibration.objective.fused import FusedObjective, Fusion, Scale
 from coec.calibration.search.global_search import at_rim, basin_next_to, find_basins, highest_summit
 from coec.calibration.search.local_search import TRANSLATIONS, SearchResult, box_of, maximise, near, polish_in_turn
 from coec.calibration.types import (
@@ -213,6 +213,7 @@ class EstimatorResult:
         search: the end of the search on it.
         metrics: those that only this objective has.
         edges: the edges of the window; None if it used none.
+        edge_scale: of the significance of the sharpest edges at other poses; None likewise.
         cues: what each cue contributed; empty if there is one only.
     """
 
@@ -220,6 +221,7 @@ class EstimatorResult:
     search: SearchResult
     metrics: tuple[Metric, ...]
     edges: EdgeCue | None = None
+    edge_scale: Scale | None = None
     cues: tuple[CueShare, ...] = ()
 
 
@@ -274,7 +276,7 @@ def by_fusion(data: WindowData, config: CalibrationConfig) -> EstimatorResult:
     count = Metric("range_edges", edges.effective_count, least_range_edges(config), at_least=True)
     objective, search = settle_basin(fusion, edges, summits, polished.evaluations, data, config)
     cues = objective.cue_shares(edges, search.T_camera_lidar, config.search.dof)
-    return EstimatorResult(objective, search, (count, *contrast), edges, cues)
+    return EstimatorResult(objective, search, (count, *contrast), edges, objective.edge_scale, cues)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

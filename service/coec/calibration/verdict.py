@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.figures import FIGURES
 from coec.calibration.objective.edges import IndependentSamples
+from coec.calibration.objective.fused import Scale
 from coec.calibration.objective.landscape import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.search.change_point import ChangePoint
@@ -137,13 +138,21 @@ def intrinsics_metric(distribution: posterior.Posterior | None, limits: VerdictC
     return (Metric(INTRINSICS_OFF, certainty, limits.max_intrinsics_certainty, at_least=False),)
 
 
-def _also_on_the_sharpest(metrics: tuple[Metric, ...], evaluation: Evaluation) -> tuple[Metric, ...]:
-    """The metrics of an objective, with the edge contrast of its basin on blurred edges, or on the sharpest ones at the
-    optimum, whichever is less: between boards and walls, blurred edges also fit where no sharp one does."""
-    sharp = evaluation.edge_contrast
+def _also_on_the_sharpest(metrics: tuple[Metric, ...], sharp: float) -> tuple[Metric, ...]:
+    """The metrics of an objective, with the edge contrast of its basin on blurred edges, or `sharp` on the sharpest
+    ones, whichever is less: between boards and walls, blurred edges also fit where no sharp one does."""
     return tuple(
         replace(m, value=min(m.value, sharp)) if m.name == EDGE_CONTRAST and isfinite(sharp) else m for m in metrics
     )
+
+
+def sharp_contrast(evaluation: Evaluation, scale: Scale | None, distribution: posterior.Posterior | None) -> float:
+    """The edge contrast on the sharpest edges: at the optimum, where `evaluation` is that of the objective, or with
+    lens, clocks and held centre at their most probable, whichever is larger. Where all is near, a held centre that is
+    off by a centimetre displaces most edges by more than their width, and still the rotation is right."""
+    if scale is None or distribution is None:
+        return evaluation.edge_contrast
+    return max(evaluation.edge_contrast, scale.standard(distribution.significance))
 
 
 def _of_a_single_frame(metric: Metric) -> Metric:
@@ -153,24 +162,26 @@ def _of_a_single_frame(metric: Metric) -> Metric:
 def optimum_metrics(
     of_objective: tuple[Metric, ...],
     evaluation: Evaluation,
+    scale: Scale | None,
     optimum: AssessedOptimum,
     change: ChangePoint | None,
     pairs: Sequence[FramePair],
     config: CalibrationConfig,
 ) -> tuple[Metric, ...]:
     """All metrics of an optimum: those of its objective, of its shape, of its edges, and of a change within the window.
-    `evaluation` is that of the objective at the optimum.
+    `evaluation` is that of the objective at the optimum, `scale` that of its edges.
 
-    A single frame repeats nothing, and its edge contrast counts all edges once. So that has to be larger, and
-    repetition is no metric of it, unless translation is searched: within one view, a shift fits one near object.
+    If translation is searched, what all frames have in common has to fit by itself: a shift fits one near object, or
+    lines along the road. A single frame has nothing else, so its edge contrast has to be larger.
     """
     limits = config.verdict
-    repeats = len(pairs) > 1 or config.search.dof == 6
     of_edges = _also_on_the_sharpest(
-        counted_once(of_objective, optimum.uncertainty.independent_samples, len(pairs)), evaluation
+        counted_once(of_objective, optimum.uncertainty.independent_samples, len(pairs)),
+        sharp_contrast(evaluation, scale, optimum.posterior),
     )
+    repeats = config.search.dof == 6
     return (
-        *(of_edges if repeats else (_of_a_single_frame(metric) for metric in of_edges)),
+        *(of_edges if repeats or len(pairs) > 1 else (_of_a_single_frame(metric) for metric in of_edges)),
         *shape_metrics(evaluation, optimum.curvature, optimum.sigma, limits),
         *(repetition_metric(optimum.independent, limits) if repeats else ()),
         *intrinsics_metric(optimum.posterior, limits),

@@ -63,18 +63,22 @@ class Scale:
 
 class FusedObjective:
     """Standardised edge significance at one blur plus standardised mutual information, for each frame and on
-    average."""
+    average.
+
+    Attributes:
+        edge_scale: of the significance of its edges at other poses.
+    """
 
     def __init__(
         self,
         edges: alignment.EdgeFrames,
         step_rad: float,
         depth: mutual_information.MutualInformation,
-        of_edges: Scale,
+        edge_scale: Scale,
         of_depth: Scale,
     ):
         self._edges, self._depth = edges, depth
-        self._of_edges, self._of_depth = of_edges, of_depth
+        self.edge_scale, self._of_depth = edge_scale, of_depth
         self._step_rad = step_rad
 
     @property
@@ -84,7 +88,7 @@ class FusedObjective:
 
     def with_depth(self, depth: mutual_information.MutualInformation) -> FusedObjective:
         """The same edges with another depth cue, on the same scale."""
-        return FusedObjective(self._edges, self._step_rad, depth, self._of_edges, self._of_depth)
+        return FusedObjective(self._edges, self._step_rad, depth, self.edge_scale, self._of_depth)
 
     def evaluate(self, T_camera_lidar: Matrix4) -> mutual_information.Evaluation:
         """The objective at `T_camera_lidar` (4, 4), in standard deviations."""
@@ -96,7 +100,7 @@ class FusedObjective:
         return [self._fused(edges.at(k), of_depth) for k, of_depth in enumerate(depth)]
 
     def _fused(self, edges: alignment.Alignment, depth: mutual_information.Evaluation) -> mutual_information.Evaluation:
-        frame_scores = (edges.of_frames - self._of_edges.mean) / self._of_edges.deviation
+        frame_scores = (edges.of_frames - self.edge_scale.mean) / self.edge_scale.deviation
         frame_scores = frame_scores + (depth.frame_scores - self._of_depth.mean) / self._of_depth.deviation
         return mutual_information.Evaluation(
             score=float(frame_scores.mean()),
@@ -104,7 +108,7 @@ class FusedObjective:
             mi=depth.mi,
             overlap=depth.overlap,
             points_in_view=depth.points_in_view,
-            edge_contrast=self._of_edges.standard(edges.significance),
+            edge_contrast=self.edge_scale.standard(edges.significance),
         )
 
     def cells(self, T_camera_lidar: Matrix4) -> mutual_information.Cells:
@@ -129,7 +133,7 @@ class FusedObjective:
             )
             for k, of_depth in enumerate(self._depth.evaluate_each(poses)):
                 square = float(of_sectors.square[k].sum())
-                scale = len(edges.maps) / sqrt(max(square, alignment.LEAST_SQUARE)) / self._of_edges.deviation
+                scale = len(edges.maps) / sqrt(max(square, alignment.LEAST_SQUARE)) / self.edge_scale.deviation
                 cells[k, :, :-1] = of_sectors.strength[k] * scale
                 cells[k, :, -1] = of_depth.frame_scores / self._of_depth.deviation
             return cells
@@ -143,7 +147,7 @@ class FusedObjective:
         moves = np.vstack([np.zeros(6), np.diag(se3.axis_steps(self._step_rad))[:dof]])
         poses = np.array([se3.perturb(T_camera_lidar, sign * move) for sign in (1.0, -1.0) for move in moves])
         sums = alignment.alignment_of_parts(cue.sharp, cue.kinds[0], KINDS, poses)
-        scale = sqrt(max(float(sums.square[0].sum()), alignment.LEAST_SQUARE)) * self._of_edges.deviation
+        scale = sqrt(max(float(sums.square[0].sum()), alignment.LEAST_SQUARE)) * self.edge_scale.deviation
         depth = self._depth.evaluate_each(poses)
         of_depth = np.array([at.score for at in depth]) / self._of_depth.deviation
         scores = np.column_stack([sums.strength.sum(axis=1) / scale, of_depth]).reshape(2, 1 + dof, KINDS + 1)

@@ -178,7 +178,7 @@ def basin_next_to(edges: EdgeCue, pose: Matrix4, reach: SearchBox) -> Matrix4:
     return np.asarray(end[0])
 
 
-SUMMIT_SPACING_RAD = (radians(0.5), radians(1.0))
+SUMMIT_SPACING_RAD = (radians(1.0), radians(2.0), radians(4.0))
 """Shifts that lead to other summits of a basin, as angles seen from the nearest edges. See docs/measured.md."""
 
 SUMMIT_STEPS_RAD = (radians(0.2), radians(0.1), radians(0.05), radians(0.025))

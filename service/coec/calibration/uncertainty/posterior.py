@@ -126,10 +126,12 @@ class Hypothesis:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posterior:
-    """All hypotheses about a window, and the share of its range edges that is independent."""
+    """All hypotheses about a window, the share of its edges that is independent, and the significance of all of them at
+    the top of the nominal hypothesis: with lens, clocks and held centre at their most probable."""
 
     hypotheses: tuple[Hypothesis, ...]
     independent_share: float
+    significance: float
 
     def of(self, *names: str) -> Hypothesis | None:
         """The most probable of the hypotheses of these names; None if none was tried."""
@@ -223,6 +225,7 @@ def measure_posterior(
             for (name, one), weight in zip(fits, weights, strict=True)
         ),
         fits[0][1].independent_share,
+        fits[0][1].significance,
     )
 
 
