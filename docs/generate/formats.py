@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from coec.io.recordings import bag_index, packet_streams
-from coec.io.ros import hesai_packets, messages, ouster_packets, packed_clouds, point_clouds
+from coec.io.ros import hesai_packets, messages, ouster_packets, packed_clouds, point_clouds, robosense_packets
 from coec.io.ros.message_decoding import DEEP_COLOURS, ENCODINGS, KNOWN, REFUSED, SEMIPLANAR
 from coec.io.ros.translations import BY_SCHEMA
 from generate.markdown import WRITTEN, code, table
@@ -75,8 +75,12 @@ def _parts() -> Iterator[tuple[str, str]]:
     for range_m, profiles in units.items():
         yield f"profiles of an Ouster with ranges in {1e3 * range_m:g} mm", _codes(profiles)
     yield "models of Hesai", ", ".join(model.name for model in hesai_packets.MODELS)
-    yield "with a correction file only", f"{hesai_packets.PLATFORM_128} and others of its platform (OT128)"
-    yield "refused by name", ", ".join(dict.fromkeys(hesai_packets.UNREAD.values()))
+    yield (
+        "models of Hesai with a correction file only",
+        f"{hesai_packets.PLATFORM_128} and others of its platform (OT128)",
+    )
+    yield "models of RoboSense", ", ".join(model.name for model in robosense_packets.MODELS)
+    yield "models of Hesai that are refused by name", ", ".join(dict.fromkeys(hesai_packets.UNREAD.values()))
 
 
 def _codes(names: Iterable[str]) -> str:

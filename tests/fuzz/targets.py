@@ -108,6 +108,7 @@ from support.packets import (
     HESAIS,
     OUSTER,
     PIXELS,
+    ROBOSENSE,
     Ouster,
     correction_file,
     hesai_message,
@@ -463,12 +464,12 @@ def _packets(data: bytes, folder: Path) -> None:
     stream = PacketStream("/packets", PACKETS[(data[0] if data else 0) % len(PACKETS)])
     for number, message in enumerate(texts[1:]):
         stream.add(message, (number,), 1000 * number)
-    sensor = stream.sensor({}, texts[0] if texts else b"")
+    sensor = stream.sensor({}, (texts[0] or None) if texts else None)
     for sweep in stream.sweeps(sensor)[0]:
         _inspected(sweep.load(lambda place: texts[1 + place[0]]))
 
 
-PACKETS = (OUSTER, HESAI)
+PACKETS = (OUSTER, HESAI, ROBOSENSE)
 
 
 def _packets_seeds() -> list[bytes]:

@@ -239,6 +239,101 @@ def hesai_message_of_ros_1(packets: Sequence[bytes]) -> bytes:
     return data
 
 
+ROBOSENSE = "rslidar_msg/msg/RslidarPacket"
+
+
+@dataclass(frozen=True)
+class Robosense:
+    """A sensor of RoboSense, after the manual of each model.
+
+    Attributes:
+        unit_mm: of ranges.
+        lens_m: from the axis to the lens.
+        lasers_us: when each laser fires after the first one.
+        firing_us: time between firings.
+    """
+
+    lasers: int
+    unit_mm: float
+    lens_m: float
+    lasers_us: tuple[float, ...]
+    firing_us: float
+    is_helios: bool = False
+
+    @property
+    def in_block(self) -> int:
+        """Firings in a block of 32 returns."""
+        return 32 // self.lasers
+
+    def directions(self) -> tuple[list[float], list[float]]:
+        """Elevations and azimuths in degrees, near those of the model, in the order of the channels."""
+        if self.lasers == 16:
+            sizes = [15.0 - 2.0 * step + 0.01 * step for step in range(8)]
+            return [-one for one in sizes] + sizes, [0.0] * 16
+        order = np.random.default_rng(4).permutation(32)
+        low, high = (-16.0, 15.0) if self.is_helios else (-25.0, 15.0)
+        return np.linspace(low, high, 32)[order].tolist(), np.round(np.linspace(-8.0, 8.0, 32), 2).tolist()
+
+    def difop(
+        self, *, dual: bool = False, blank: bool = False, directions: tuple[list[float], list[float]] | None = None
+    ) -> bytes:
+        packet = bytearray(1248)
+        packet[:8] = bytes.fromhex("a5ff005a11115555")
+        packet[300] = 0 if dual else 4 if self.is_helios else 1
+        elevations, azimuths = directions or self.directions()
+        if self.lasers == 16 and not blank:
+            packet[1165:1213] = b"".join(round(1e4 * abs(one)).to_bytes(3, "big") for one in elevations)
+        elif not blank:
+            per_degree = 100 if self.is_helios else 1000
+            signed = [(one < 0, round(per_degree * abs(one))) for one in (*elevations, *azimuths)]
+            packet[468:660] = b"".join(struct.pack(">BH", *one) for one in signed)
+        return bytes(packet)
+
+    def packet(
+        self, azimuths: Sequence[float] | NDArray[Any], units: NDArray[Any], intensity: NDArray[Any], stamp_ns: int
+    ) -> bytes:
+        """Of (12, 32) ranges in units."""
+        seconds, rest_ns = divmod(stamp_ns, 10**9)
+        if self.is_helios:
+            head = (
+                bytes.fromhex("55aa055a") + bytes(16) + seconds.to_bytes(6, "big") + struct.pack(">I", rest_ns // 1000)
+            )
+        else:
+            when = datetime.fromtimestamp(seconds, UTC)
+            date = [when.year - 2000, when.month, when.day, when.hour, when.minute, when.second]
+            parts = struct.pack(">HH", rest_ns // 10**6, rest_ns // 1000 % 1000)
+            head = bytes.fromhex("55aa050a5aa550a0") + bytes(12) + bytes(date) + parts
+        packet = head.ljust(42, b"\0")
+        for azimuth, ranges, intensities in zip(azimuths, units.tolist(), intensity.tolist(), strict=True):
+            packet += struct.pack(">HH", 0xFFEE, round(100.0 * azimuth) % 36_000)
+            packet += b"".join(struct.pack(">HB", *one) for one in zip(ranges, intensities, strict=True))
+        return packet + bytes(6)
+
+    def packets(
+        self, units: NDArray[Any], intensity: NDArray[Any], begin_ns: int, step_ns: float, first_deg: float = 0.0
+    ) -> list[bytes]:
+        """Packets of a turn of (blocks, 32) ranges."""
+        azimuths = first_deg + 360.0 * np.arange(len(units)) / len(units)
+        return [
+            self.packet(
+                azimuths[at : at + 12], units[at : at + 12], intensity[at : at + 12], begin_ns + round(at * step_ns)
+            )
+            for at in range(0, len(units), 12)
+        ]
+
+
+_LASERS_32_US = (*(2.88 * laser for laser in range(15)), 44.64, *(1.44 + 2.88 * laser for laser in range(15)), 46.08)
+RS_16 = Robosense(16, 5.0, 0.03825, tuple(2.8 * laser for laser in range(16)), 55.5)
+RS_32 = Robosense(32, 5.0, 0.03997, _LASERS_32_US, 55.52)
+HELIOS = Robosense(32, 2.5, 0.03498, tuple(1.73 * laser for laser in range(32)), 55.56, is_helios=True)
+ROBOSENSES = {"RS-16": RS_16, "RS-32": RS_32, "Helios": HELIOS}
+
+
+def robosense_message(packet: bytes, frame: str = "rslidar", begin: bool = False) -> bytes:
+    packer = Packer().header(frame, 5, 0).put("B", packet[0] == 0xA5, begin)
+    return packer.octets(packet).done()
+
+
 def bytes_message(data: bytes) -> bytes:
     """`std_msgs/UInt8MultiArray` without dimensions."""
     return Packer().put("I", 0, 0).octets(data).done()

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import coec
 from coec.calibration.types import LidarFrame
@@ -18,8 +19,11 @@ from coec.io.ros import messages
 from coec.io.ros.ouster_packets import OusterSensor
 from coec.io.ros.topics import FrameTopics, PairTopics
 from support.packets import (
+    HELIOS,
     HESAI,
     OUSTER,
+    ROBOSENSE,
+    RS_32,
     STRING,
     XT32,
     Entry,
@@ -29,12 +33,17 @@ from support.packets import (
     gridded,
     hesai_message,
     ouster_message,
+    robosense_message,
     string_message,
     write_entries,
 )
 from support.recordings import STORE, T_BASE_LIDAR, TREE, drive_messages, transform_message
 from support.simulated_drives import rendered_source
 
+STORE_WITH_PACKETS = get_typestore(Stores.ROS2_HUMBLE)
+STORE_WITH_PACKETS.register(
+    get_types_from_msg("std_msgs/Header header\nuint8 is_difop\nuint8 is_frame_begin\nuint8[] data\n", ROBOSENSE)
+)
 SECOND_NS, SWEEP_NS = 10**9, 100_000_000
 TO_MIDDLE_NS = 3 * SWEEP_NS // 8
 """From the first column of the first of four packets to that between the first and the last."""
@@ -268,6 +277,34 @@ def test_the_clock_of_a_hesai_that_was_never_set_begins_at_2000(tmp_path: Path) 
     np.testing.assert_allclose(stamps_s, HESAI_MIDDLE_S + 0.002 + 0.1 / 64 + 0.1 * np.arange(6), atol=1e-5)
 
 
+# --- RoboSense --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "ros1"])
+def test_a_recording_of_packets_of_a_robosense(tmp_path: Path, encoding: str) -> None:
+    entries: list[Entry] = []
+    for index in range(4):
+        units = np.full((48, 32), 1000 + 20 * index)
+        sent = RS_32.packets(units, units % 251, BEGIN_NS + index * SWEEP_NS, SWEEP_NS / 48)
+        entries += [(BEGIN_NS + (index + 1) * SWEEP_NS, PACKETS, ROBOSENSE, robosense_message(one)) for one in sent]
+    entries.insert(5, (BEGIN_NS, PACKETS, ROBOSENSE, robosense_message(RS_32.difop())))
+    tree = [*TREE[1:], transform_message("base", "rslidar", T_BASE_LIDAR)]
+    every = [*others(tree), *entries]
+    if encoding == "ros1":
+        every = [
+            (time, topic, name.replace("/msg/", "/"), bytes(STORE_WITH_PACKETS.cdr_to_ros1(data, name)))
+            for time, topic, name, data in every
+        ]
+    recording = open_source(str(write_entries(tmp_path / "drive.mcap", every, encoding)))
+    sweeps = sweeps_of(recording)
+    assert [len(sweep.xyz_m) for sweep in sweeps] == [48 * 32] * 4
+    stamps_s = [(sweep.stamp_ns - BEGIN_NS) * 1e-9 for sweep in sweeps]
+    # Between the first block and the last one, the last packet's blocks 55.52 us apart.
+    np.testing.assert_allclose(stamps_s, (0.075 + 11 * 55.52e-6) / 2 + 0.1 * np.arange(4), atol=2e-6)
+    assert recording.rig.lidar_frame == "rslidar"
+    assert set(codes(recording)) <= {"already_compensated"}
+
+
 # --- a drive in packets decides as one of points ----------------------------------------------------------------------
 
 SIM = "sim:seed=3&seconds=30&camera_hz=0.5&lidar_hz=0.5&camera=pinhole640x400@90&lidar=32"
@@ -314,6 +351,34 @@ def test_a_drive_in_packets_of_a_hesai_decides_within_one_sigma_of_the_same_driv
     distance = distance_of(tmp_path, drive, hesai_entries(sweeps, drive.rig.lidar_frame))
     record_property("figure", f"PandarXT-32: {distance:.2f} standard deviations")
     assert distance < 1.0
+
+
+@pytest.mark.slow
+def test_a_drive_in_packets_of_a_robosense_decides_within_one_sigma_of_the_same_drive_as_points(
+    tmp_path: Path, record_property: Any
+) -> None:
+    drive = rendered_source(SIM)
+    sweeps = [frame for frame in drive.messages() if isinstance(frame, LidarFrame)]
+    distance = distance_of(tmp_path, drive, robosense_entries(sweeps, drive.rig.lidar_frame))
+    record_property("figure", f"Helios: {distance:.2f} standard deviations")
+    assert distance < 1.0
+
+
+def robosense_entries(sweeps: list[LidarFrame], frame: str) -> list[Entry]:
+    """The simulated LiDAR as a Helios, whose lasers are turned so that they fire in one direction."""
+    elevations = elevations_of(sweeps)
+    along_block = [-360.0 / COLUMNS * each / HELIOS.firing_us for each in HELIOS.lasers_us]
+    difop = HELIOS.difop(directions=(elevations, along_block))
+    entries: list[Entry] = [(0, PACKETS, ROBOSENSE, robosense_message(difop, frame))]
+    for one in sweeps:
+        ranges, intensity = gridded(one, COLUMNS, 32)
+        begin_ns = one.stamp_ns - SWEEP_NS // 2 + SWEEP_NS // COLUMNS // 2
+        from_lens = ranges - HELIOS.lens_m / np.cos(np.radians(elevations))
+        units = np.rint(np.where(ranges > 0.0, from_lens, 0.0) / 0.0025).astype(int)
+        sent = HELIOS.packets(units, intensity.astype(int), begin_ns, SWEEP_NS / COLUMNS, 180.0 + 180.0 / COLUMNS)
+        sweep = [robosense_message(each, frame, begin=each is sent[0]) for each in sent]
+        entries += [(begin_ns + SWEEP_NS, PACKETS, ROBOSENSE, message) for message in sweep]
+    return entries
 
 
 def hesai_entries(sweeps: list[LidarFrame], frame: str) -> list[Entry]:

@@ -291,7 +291,8 @@ def test_a_type_that_is_not_read_is_refused() -> None:
         ("ffmpeg_image_transport_msgs/msg/FFMPEGPacket", "JPEG"),
         ("ouster_sensor_msgs/msg/PacketMsg", "recordings only: take the topic of PointCloud2"),
         ("hesai_ros_driver/msg/UdpFrame", "recordings only: take .* of hesai_ros_driver or nebula_ros"),
-        ("rslidar_msg/msg/RslidarPacket", "msg_source: 2"),
+        ("rslidar_msg/msg/RslidarPacket", "recordings only: take .* of rslidar_sdk"),
+        ("rslidar_msgs/msg/rslidarScan", "msg_source: 2"),
     ],
 )
 def test_a_type_that_people_take_for_the_right_one_is_refused_with_what_to_do(type_name: str, advice: str) -> None:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from coec.calibration.types import LidarFrame, Matrix4, Recognition
 from coec.errors import DecodeError
 from coec.io.frame_validation import Refusal
-from coec.io.ros import hesai_packets, messages, ouster_packets
+from coec.io.ros import hesai_packets, messages, ouster_packets, robosense_packets
 
 MAX_DESCRIPTION_BYTES: Final = 2**20
 """Longest text in which a sensor says what it is; Ouster's has some 10 kB."""
@@ -61,7 +61,7 @@ class PacketSensor(Protocol):
 
     def heads(self, glimpses: Sequence[bytes]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """(N, 2) first and last time of each message by the sensor's clock, ns, and (N,) number of its sweep, -1 for
-        something else."""
+        something else, -2 for what the sensor sends beside points."""
 
     def sweep(self, payloads: Sequence[bytes], at_ns: int, stamp_ns: int) -> LidarFrame:
         """The points of some messages; `at_ns` by the sensor's clock is `stamp_ns` of the recording."""
@@ -84,6 +84,7 @@ class PacketFormat(Protocol):
 FORMATS: Final[Mapping[str, PacketFormat]] = {
     **dict.fromkeys(messages.OUSTER_PACKETS, ouster_packets),
     **dict.fromkeys((messages.HESAI_PACKETS, messages.PANDAR_PACKETS, messages.NEBULA_PACKETS), hesai_packets),
+    messages.ROBOSENSE_PACKET: robosense_packets,
 }
 """By the type of the messages that are read."""
 
@@ -188,7 +189,7 @@ class PacketStream:
         if np.median(middles_ns) < SET_S * 1e9:
             stamps_ns = middles_ns + _ahead_ns(np.array([self._lag_ns(group, times_ns[group]) for group in groups]))
             notes = (*notes, _FREE_RUNNING)
-        other = int((numbers < 0).sum())
+        other = int((numbers == -1).sum())
         if other:
             text = f"{other} of {len(numbers)} packets of the LiDAR have another form than its metadata say: left out."
             notes = (*notes, Recognition("packets_left_out", text, "warn"))

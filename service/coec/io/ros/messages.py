@@ -33,6 +33,7 @@ OUSTER_PACKETS: Final = tuple(
 HESAI_PACKETS: Final = "hesai_ros_driver/msg/UdpFrame"
 PANDAR_PACKETS: Final = "pandar_msgs/msg/PandarScan"
 NEBULA_PACKETS: Final = "nebula_msgs/msg/NebulaPackets"
+ROBOSENSE_PACKET: Final = "rslidar_msg/msg/RslidarPacket"
 STRING: Final = "std_msgs/msg/String"
 BYTES: Final = "std_msgs/msg/UInt8MultiArray"
 COMPRESSED_CLOUD: Final = "point_cloud_interfaces/msg/CompressedPointCloud2"
@@ -45,6 +46,7 @@ _DEFINITIONS: Final = {
     VELODYNE_SCAN: "std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets\n",
     "nebula_msgs/msg/NebulaPacket": "builtin_interfaces/Time stamp\nuint8[] data\n",
     NEBULA_PACKETS: "std_msgs/Header header\nnebula_msgs/NebulaPacket[] packets\n",
+    ROBOSENSE_PACKET: "std_msgs/Header header\nuint8 is_difop\nuint8 is_frame_begin\nuint8[] data\n",
     **dict.fromkeys(OUSTER_PACKETS, "uint8[] buf\n"),
     COMPRESSED_CLOUD: "std_msgs/Header header\nuint32 height\nuint32 width\nsensor_msgs/PointField[] fields\n"
     "bool is_bigendian\nuint32 point_step\nuint32 row_step\nuint8[] compressed_data\nbool is_dense\nstring format\n",
@@ -173,6 +175,13 @@ class MessageCursor:
             raise DecodeError(Refusal.MESSAGE_MALFORMED, "the message ends within its head") from error
         self._at += 4
         return int(value)
+
+    def byte(self) -> int:
+        """The next uint8."""
+        if self._at >= len(self._payload):
+            raise DecodeError(Refusal.MESSAGE_MALFORMED, "the message ends within its head")
+        self._at += 1
+        return self._payload[self._at - 1]
 
     def place(self) -> int:
         """Where the next uint32 stands in the message."""
