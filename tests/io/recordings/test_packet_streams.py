@@ -174,6 +174,20 @@ def test_a_clock_that_counts_from_its_start_is_tied_to_that_of_the_recorder(tmp_
         np.testing.assert_allclose(np.ptp(sweep.time_offset_s), 0.1 * 63 / 64, atol=1e-6)
 
 
+def test_a_difference_between_clocks_is_named_as_it_is_of_clouds(tmp_path: Path) -> None:
+    entries = [HEAD, *others(), *packets(sensor_begin_ns=BEGIN_NS + 37 * SECOND_NS)]
+    path = write_entries(tmp_path / "drive.mcap", entries)
+    assert "TAI" in codes(open_source(str(path)))["header_clock"]
+    moved = sweeps_of(open_source(f"{path}?lidar_offset=-37"))
+    assert [sweep.stamp_ns - TO_MIDDLE_NS for sweep in moved] == [BEGIN_NS + index * SWEEP_NS for index in range(6)]
+
+
+def test_what_somebody_else_says_of_elevations_is_not_the_lidars(tmp_path: Path) -> None:
+    other = (BEGIN_NS, "/survey", STRING, string_message(b'{"Elevation": 5, "beam_altitude": 3}'))
+    recording = open_source(str(write_entries(tmp_path / "drive.mcap", [other, *others(), *hesai_turns()])))
+    assert "nominal_angles" in codes(recording)
+
+
 def test_a_restarted_sensor_has_another_clock(tmp_path: Path) -> None:
     before, after = packets(3, sensor_begin_ns=500 * SECOND_NS), packets(3, sensor_begin_ns=9 * SECOND_NS)
     entries = [HEAD, *others(), *before, *((time + SECOND_NS, *rest) for time, *rest in after)]
@@ -189,9 +203,13 @@ def test_lost_late_and_foreign_packets(tmp_path: Path) -> None:
     lost, late = recorded.pop(5), recorded.pop(9)
     recorded.insert(10, late)
     recorded.insert(12, (lost[0], PACKETS, OUSTER, ouster_message(bytes(600))))
+    recorded.insert(15, (lost[0], PACKETS, OUSTER, lost[3][:-40]))
     recording = open_source(str(write_entries(tmp_path / "drive.mcap", [HEAD, *others(), *recorded])))
     assert [len(sweep.xyz_m) for sweep in sweeps_of(recording)] == [192, 256, 256, 256]
-    assert codes(recording)["packets_left_out"].startswith("1 of 21 packets of the LiDAR have another form")
+    assert codes(recording)["packets_left_out"].startswith(
+        "Of 22 messages of the LiDAR, 1 have packets in another form"
+    )
+    assert "and 1 are damaged" in codes(recording)["packets_left_out"]
 
 
 def test_low_data_says_that_ranges_are_coarse(tmp_path: Path) -> None:
@@ -214,11 +232,15 @@ def test_a_topic_of_points_comes_before_one_of_packets(tmp_path: Path) -> None:
     assert open_source(str(write_entries(tmp_path / "both.mcap", entries))).rig.lidar_frame == "lidar"
 
 
-def test_a_packet_that_is_cut_off_is_named(tmp_path: Path) -> None:
+def test_damaged_packets_are_named_and_end_nothing_else(tmp_path: Path) -> None:
     sent = packets(1)
     damaged = (*sent[0][:3], sent[0][3][:-40])
-    with pytest.raises(SourceError, match=f"on {PACKETS} is refused: the packet is cut off"):
+    with pytest.raises(SourceError, match=f"{PACKETS} has packets of a LiDAR: the packet is cut off"):
         open_source(str(write_entries(tmp_path / "drive.mcap", [HEAD, *others(), damaged])))
+    cloud = next(message for topic, message in drive_messages() if topic == "/points")
+    points = (BEGIN_NS, "/points", messages.POINT_CLOUD, bytes(STORE.serialize_cdr(cloud, messages.POINT_CLOUD)))
+    entries = [points, *others([*SENSOR_TREE, TREE[0]]), damaged]
+    assert open_source(str(write_entries(tmp_path / "both.mcap", entries))).rig.lidar_frame == "lidar"
 
 
 # --- Hesai ------------------------------------------------------------------------------------------------------------

@@ -135,6 +135,15 @@ def test_every_message_holds_the_same(type_name: str, fixed: int) -> None:
     np.testing.assert_array_equal(sweep.xyz_m, sweep_of(hesai_message(packets)).xyz_m)
 
 
+def test_an_early_message_has_no_header() -> None:
+    _, packets = turn(XT16)
+    message = hesai_message(packets)
+    begin = 4 + 8 + 4 + 8  # encapsulation, stamp, and the frame with its zero and padding
+    sweep = sweep_of(message[:4] + message[begin:])
+    np.testing.assert_array_equal(sweep.xyz_m, sweep_of(message).xyz_m)
+    assert sweep.frame_id == "hesai_lidar"
+
+
 def test_a_message_of_ros_1_is_the_same() -> None:
     _, packets = turn(P40)
     number = translation_of("ros1", "pandar_msgs/PandarScan")

@@ -307,8 +307,8 @@ class BagIndex:
         """
         name = entry.type_name
         if name in packet_streams.TYPES:
-            packets = self.packets.setdefault(entry.topic, PacketStream(entry.topic, name))
-            self._decoded(entry, lambda data: packets.add(data, entry.place, entry.logged_ns))
+            stream_of_packets = self.packets.setdefault(entry.topic, PacketStream(entry.topic, name))
+            stream_of_packets.add(entry.data, entry.place, entry.logged_ns)
         elif name in (*IMAGE_TYPES, *CLOUD_TYPES, *VELOCITY_TYPES, *ROTATION_TYPES):
             stream = self.streams.setdefault(entry.topic, TopicStream(name))
             stamp_ns = _header_stamp_ns(entry.data)

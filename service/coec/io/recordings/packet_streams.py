@@ -128,6 +128,7 @@ class PacketStream:
 
     Attributes:
         topic, type_name: where they came, and their type.
+        damaged: how many were no such messages; `error`: why the last one was not.
     """
 
     topic: str
@@ -135,14 +136,16 @@ class PacketStream:
     places: list[tuple[int, ...]] = field(default_factory=list)
     glimpses: list[bytes] = field(default_factory=list)
     logged_ns: array[int] = field(default_factory=lambda: array("q"))
+    damaged: int = 0
+    error: DecodeError | None = None
 
     def add(self, payload: bytes, place: tuple[int, ...], logged_ns: int) -> None:
-        """Notes a message.
-
-        Raises:
-            DecodeError: it is not one.
-        """
-        self.glimpses.append(FORMATS[self.type_name].glimpse(payload))
+        """Notes a message."""
+        try:
+            self.glimpses.append(FORMATS[self.type_name].glimpse(payload))
+        except DecodeError as error:
+            self.damaged, self.error = self.damaged + 1, error
+            return
         self.places.append(place)
         self.logged_ns.append(logged_ns)
 
@@ -157,7 +160,7 @@ class PacketStream:
             DecodeError: nothing says what it is, or several; or its packets are not read.
         """
         if not self.glimpses:
-            raise DecodeError(Refusal.MESSAGE_MALFORMED, "there are no packets")
+            raise self.error or DecodeError(Refusal.MESSAGE_MALFORMED, "there are no packets")
         of_maker = FORMATS[self.type_name]
         if isinstance(given, bytes):
             return of_maker.sensor_of(self.glimpses, given)
@@ -190,8 +193,11 @@ class PacketStream:
             stamps_ns = middles_ns + _ahead_ns(np.array([self._lag_ns(group, times_ns[group]) for group in groups]))
             notes = (*notes, _FREE_RUNNING)
         other = int((numbers == -1).sum())
-        if other:
-            text = f"{other} of {len(numbers)} packets of the LiDAR have another form than its metadata say: left out."
+        if other or self.damaged:
+            text = (
+                f"Of {len(numbers) + self.damaged} messages of the LiDAR, {other} have packets in another form than "
+                f"those of points, and {self.damaged} are damaged: left out."
+            )
             notes = (*notes, Recognition("packets_left_out", text, "warn"))
         times = (middles_ns.tolist(), stamps_ns.tolist(), logged_ns.tolist())
         sweeps = [

@@ -31,8 +31,11 @@ from coec.errors import DecodeError
 from coec.io.frame_validation import Refusal, lidar_frame
 from coec.io.ros import messages
 
-DESCRIBED: Final = b"Elevation"
+DESCRIBED: Final = b"Elevation,Azimuth"
 """What a correction file has in its first lines."""
+
+WITHOUT_HEADER: Final = "hesai_lidar"
+"""Frame of messages that name none: the default of hesai_ros_driver."""
 
 MAX_PACKETS: Final = 8192
 """Most packets of a message; a turn of the largest model at 5 Hz has 2,700."""
@@ -268,14 +271,18 @@ def _in_form(data: memoryview, at: int, count: int, form: _Form, alignment: int)
 
 
 def _read(payload: bytes) -> tuple[str, list[memoryview]]:
-    """Frame and packets of a message in CDR."""
-    head = messages.check_header(payload)
-    if payload[1] != 1:
-        raise DecodeError(Refusal.MESSAGE_MALFORMED, "packets of a Hesai in big-endian CDR are not read")
-    begin = head.place()
-    if begin + 4 > len(payload):
-        raise DecodeError(Refusal.MESSAGE_MALFORMED, "the message ends within its head")
-    return messages.header_frame_id(payload), _packets(payload, begin, 4)
+    """Frame and packets of a message in CDR. Early versions of `UdpFrame` have no header."""
+    if payload[1:2] != b"\1":
+        raise DecodeError(Refusal.MESSAGE_MALFORMED, "not a message in little-endian CDR")
+    try:
+        begin = messages.check_header(payload).place()
+        return messages.header_frame_id(payload), _packets(payload, begin, 4)
+    except (DecodeError, struct.error) as error:
+        try:
+            return WITHOUT_HEADER, _packets(payload, 4, 4)
+        except (DecodeError, struct.error):
+            what = "the packets of a Hesai are cut off, too many, or in an unknown form"
+            raise DecodeError(Refusal.MESSAGE_MALFORMED, what) from error
 
 
 def cdr_of_ros_1(data: bytes) -> bytes:
