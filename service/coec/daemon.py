@@ -17,7 +17,6 @@ from coec.errors import CoecError, ConfigError, ExitCode, ModelError, Unavailabl
 from coec.io import logs, system
 from coec.io.disk_writer import DiskWriter
 from coec.io.serialise import reasons_of
-from coec.io.system import ServiceManagerNotifier, ServiceThread, resident_bytes
 from coec.io.zenoh.bus import Answer, Bus, open_session
 from coec.io.zenoh.command_auth import CommandListener, credentials_of
 from coec.io.zenoh.ros_node import RosPublishers, RosSide
@@ -91,7 +90,7 @@ def exit_code_of(error: CoecError) -> ExitCode:
 class Daemon:
     """Composes the service from its parts."""
 
-    def __init__(self, config: Config, notifier: ServiceManagerNotifier, lock: FolderLock) -> None:
+    def __init__(self, config: Config, notifier: system.ServiceManagerNotifier, lock: FolderLock) -> None:
         """Builds everything and opens the Zenoh session. No thread runs yet. `lock` is that of the state directory.
 
         Raises:
@@ -449,13 +448,13 @@ class Daemon:
 
     # --- status -----------------------------------------------------------------------------------------------------
 
-    def _threads(self) -> list[ServiceThread]:
+    def _threads(self) -> list[system.ServiceThread]:
         """All of them."""
         door = [] if self._metrics_server.server is None else [self._metrics_server.server.thread]
         waiting = [thread for thread in self._bus.threads if thread not in self._bus.prompt_threads]
         return [*self._prompt_threads(), self._disk_writer.thread, *waiting, *door, self._recording.thread]
 
-    def _prompt_threads(self) -> list[ServiceThread]:
+    def _prompt_threads(self) -> list[system.ServiceThread]:
         """The threads that never wait for a disk. Only these must beat: a thread that waits for a slow disk may stand
         still as long as the disk takes. `health` reports that, and a restart would not make the disk quicker."""
         of_ros = (*self._pending_pairs.threads, *self._ros_outputs.threads)
@@ -538,7 +537,7 @@ class Daemon:
             metrics.JOB: [LabelledHistogram((), self._worker.jobs_took)],
             metrics.WORK: [LabelledHistogram((), self._worker.work_took)],
         }
-        memory = (resident_bytes(), self._worker.status().rss_bytes)
+        memory = (system.resident_bytes(), self._worker.status().rss_bytes)
         view = MetricsInput(self._status_reply, self._health(), *memory, took, self._rig_answers.reply, self._uplink)
         return metrics.render(view, text_format)
 
@@ -579,7 +578,7 @@ def run(config: Config, reread: Callable[[], Config] | None = None) -> int:
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     try:
         with handled_signals() as signals, locked(config.state.directory) as lock:
-            return Daemon(config, ServiceManagerNotifier.from_environment(), lock).serve(signals, reread)
+            return Daemon(config, system.ServiceManagerNotifier.from_environment(), lock).serve(signals, reread)
     except CoecError as error:
         _log.error(str(error), extra={"fields": {"code": error.reply_code}})
         return exit_code_of(error)

@@ -40,7 +40,6 @@ from coec.io.recordings.recording_source import HasGroundTruth
 from coec.io.recordings.window_cutting import LoadedWindow, NoPairsError
 from coec.io.rig_files import intrinsics_config
 from coec.io.serialise import matrix_of, mistake_of, result_of
-from coec.io.user_files import read_bytes
 from coec.reports.drawing import titled
 from coec.reports.formatting import count
 from coec.reports.recording_fitness import Cadence, cadence
@@ -345,7 +344,7 @@ def _present_text(path: Path) -> str | None:
     if not path.exists():
         return None
     try:
-        return read_bytes(path, MAX_EXPORT_BYTES).decode()
+        return user_files.read_bytes(path, MAX_EXPORT_BYTES).decode()
     except UnicodeDecodeError as error:
         raise SourceError(f"{path} is not UTF-8 text: it cannot be changed") from error
 

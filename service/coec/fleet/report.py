@@ -17,7 +17,6 @@ from coec.calibration.baseline import poisson_most
 from coec.errors import SourceError, UsageError
 from coec.io import user_files
 from coec.schemas import documents
-from coec.schemas.documents import AXES, WindowRow
 from coec.schemas.heartbeat import LastWord
 from coec.schemas.message import to_json
 from coec.schemas.replies import Maybe6, Maybe6x6
@@ -61,8 +60,8 @@ def table_schema() -> Any:
             ("stamp_ns", whole),
             ("time", pa.timestamp("us", tz="UTC")),
             ("pairs", whole),
-            *((axis, number) for axis in AXES),
-            *((f"sigma_{axis}", number) for axis in AXES),
+            *((axis, number) for axis in documents.AXES),
+            *((f"sigma_{axis}", number) for axis in documents.AXES),
             ("correlation", pa.list_(number, 36)),
             ("camera_from_lidar", pa.list_(number, 16)),
             ("observed", pa.list_(pa.bool_(), 6)),
@@ -95,13 +94,13 @@ def table_schema() -> Any:
     )
 
 
-def write_tables(folder: Path, rows: Iterable[WindowRow], name: str) -> None:
+def write_tables(folder: Path, rows: Iterable[documents.WindowRow], name: str) -> None:
     """Writes a file of this name for each date and vehicle, each completely or not at all.
 
     Raises:
         OutputError: a file cannot be written.
     """
-    groups: dict[str, list[WindowRow]] = defaultdict(list)
+    groups: dict[str, list[documents.WindowRow]] = defaultdict(list)
     for row in rows:
         date = UNDATED if row.result is None else f"{_time(row.result.data_stamp_ns):%Y-%m-%d}"
         groups[f"date={date}/vehicle={quote(row.vehicle, safe='') or NAMELESS}"].append(row)
@@ -130,7 +129,7 @@ def _time(stamp_ns: int) -> datetime:
     return datetime.fromtimestamp(stamp_ns // NS_PER_S, UTC)
 
 
-def _parquet(rows: Sequence[WindowRow]) -> bytes:
+def _parquet(rows: Sequence[documents.WindowRow]) -> bytes:
     pa, parquet = optional_library("pyarrow"), optional_library("pyarrow.parquet")
 
     table = pa.Table.from_pylist([_row_values(row) for row in sorted(rows, key=lambda row: row.url)], table_schema())
@@ -148,7 +147,7 @@ _OF_RESULT = {
 """Columns that are fields of a row, or of its result, by the same name."""
 
 
-def _row_values(row: WindowRow) -> dict[str, Any]:
+def _row_values(row: documents.WindowRow) -> dict[str, Any]:
     """The values of a row. Maps are in the order of their names, so that equal rows give equal bytes, also in a resumed
     batch."""
     fields: dict[str, Any] = {
@@ -166,8 +165,8 @@ def _row_values(row: WindowRow) -> dict[str, Any]:
         **result.model_dump(include=_OF_RESULT),
         "stamp_ns": result.data_stamp_ns,
         "time": _time(result.data_stamp_ns),
-        **dict(zip(AXES, result.correction, strict=True)),
-        **{f"sigma_{axis}": value for axis, value in zip(AXES, result.sigma, strict=True)},
+        **dict(zip(documents.AXES, result.correction, strict=True)),
+        **{f"sigma_{axis}": value for axis, value in zip(documents.AXES, result.sigma, strict=True)},
         "correlation": _correlation(result.noise),
         "camera_from_lidar": [value for line in result.camera_from_lidar.matrix for value in line],
         "observed": [solved and not blind for solved, blind in seen],

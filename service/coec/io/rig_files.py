@@ -20,28 +20,16 @@ from cattrs import Converter, override
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from coec import config
 from coec.calibration.baseline import Accuracy, Baseline, MonitorLimits, for_rig
 from coec.calibration.monitor.sensor_faults import BANDS, BLOCK_COLUMNS, BLOCK_ROWS, SECTORS, SceneBaseline
 from coec.calibration.types import CloudFrame, Matrix4, Rig, SweepTiming
-from coec.config import (
-    IDENTITY,
-    CameraIntrinsics,
-    LidarConfig,
-    LimitsConfig,
-    Matrix4x4,
-    OpenPairConfig,
-    PairConfig,
-    StateConfig,
-    SweepConfig,
-    describe,
-)
 from coec.config.poses import rigidity_problem
 from coec.errors import ConfigError, DecodeError, StateError, WindowError, cannot_read, require_readable
 from coec.geometry import cameras, se3
 from coec.io import converter, storage
 from coec.io.converter import POSE, MalformedValueError, array, make_converter, null_for, register, structured
 from coec.io.images import decode_bgr, encode_png, probe
-from coec.io.storage import StateFile
 
 NOT_ALWAYS_THERE = ("sweep", "cloud")
 """Entries of `rig_identity` that a rig has only if they are configured."""
@@ -51,7 +39,7 @@ ROUNDING = 1e-9
 known to, far above the rounding of a double."""
 
 
-def rig_of(pair: PairConfig) -> Rig:
+def rig_of(pair: config.PairConfig) -> Rig:
     """The rig that a configuration describes; reads its mask.
 
     Raises:
@@ -73,7 +61,7 @@ def rig_of(pair: PairConfig) -> Rig:
     )
 
 
-def check_given(pair: OpenPairConfig) -> None:
+def check_given(pair: config.OpenPairConfig) -> None:
     """Checks the parts of an awaited pair's rig that the configuration gives, as far as possible without the rest.
 
     Raises:
@@ -94,7 +82,7 @@ def check_given(pair: OpenPairConfig) -> None:
             rigid_matrix(rows, f"{where}, {name}")
 
 
-def camera_of(intrinsics: CameraIntrinsics) -> cameras.Camera:
+def camera_of(intrinsics: config.CameraIntrinsics) -> cameras.Camera:
     """The camera that intrinsics describe.
 
     Raises:
@@ -103,7 +91,7 @@ def camera_of(intrinsics: CameraIntrinsics) -> cameras.Camera:
     return _camera(intrinsics, "camera")
 
 
-def rigid_matrix(rows: Matrix4x4, where: str) -> Matrix4:
+def rigid_matrix(rows: config.Matrix4x4, where: str) -> Matrix4:
     """(4, 4) float64, checked to be a rotation and a translation.
 
     Raises:
@@ -135,7 +123,7 @@ def mask_from_image(data: bytes, camera: cameras.Camera) -> NDArray[np.bool_]:
     Raises:
         DecodeError: not an image, or not of the camera's size.
     """
-    limits = LimitsConfig()
+    limits = config.LimitsConfig()
     image = probe(data, limits)
     if (image.width, image.height) != (camera.width, camera.height):
         raise DecodeError(
@@ -150,9 +138,9 @@ def mask_to_png(mask: NDArray[np.bool_]) -> bytes:
     return encode_png(np.where(mask, np.uint8(255), np.uint8(0)))
 
 
-def intrinsics_config(camera: cameras.Camera) -> CameraIntrinsics:
+def intrinsics_config(camera: cameras.Camera) -> config.CameraIntrinsics:
     """The intrinsics as a configuration holds them."""
-    return CameraIntrinsics.model_validate({"model": cameras.name_of(camera), **cameras.intrinsics_of(camera)})
+    return config.CameraIntrinsics.model_validate({"model": cameras.name_of(camera), **cameras.intrinsics_of(camera)})
 
 
 def rig_to_json(rig: Rig) -> dict[str, Any]:
@@ -217,26 +205,26 @@ def rig_from_json(document: object, mask_png: bytes | None) -> Rig:
         raise WindowError(f"the rig is damaged: {error}") from error
 
 
-def matrix_rows(T: Matrix4) -> Matrix4x4:
+def matrix_rows(T: Matrix4) -> config.Matrix4x4:
     """(4, 4) as nested tuples of Python floats."""
     a, b, c, d = ((float(w), float(x), float(y), float(z)) for w, x, y, z in T)
     return a, b, c, d
 
 
-def _camera(intrinsics: CameraIntrinsics, where: str) -> cameras.Camera:
+def _camera(intrinsics: config.CameraIntrinsics, where: str) -> cameras.Camera:
     try:
         return cameras.build(intrinsics.model, **intrinsics.parameters())
     except ValueError as error:
         raise ConfigError(f"{where}: {error}") from error
 
 
-def _cloud(lidar: LidarConfig, where: str) -> CloudFrame | None:
-    if lidar.cloud_frame_id is None and lidar.T_cloud_lidar == IDENTITY:
+def _cloud(lidar: config.LidarConfig, where: str) -> CloudFrame | None:
+    if lidar.cloud_frame_id is None and lidar.T_cloud_lidar == config.IDENTITY:
         return None
     return CloudFrame(lidar.cloud_frame_id or lidar.frame_id, rigid_matrix(lidar.T_cloud_lidar, where))
 
 
-def _sweep(sweep: SweepConfig) -> SweepTiming:
+def _sweep(sweep: config.SweepConfig) -> SweepTiming:
     return SweepTiming(sweep.period_s, sweep.sign, math.radians(sweep.stamp_azimuth_deg))
 
 
@@ -270,11 +258,11 @@ def _rig_form() -> Converter:
 
 def _read_camera(value: Any, _: object) -> cameras.Camera:
     try:
-        intrinsics = CameraIntrinsics.model_validate(value)
+        intrinsics = config.CameraIntrinsics.model_validate(value)
         return cameras.build(intrinsics.model, **intrinsics.parameters())
     except ValueError as error:
         raise converter.MalformedValueError(
-            describe(error) if isinstance(error, ValidationError) else str(error)
+            config.describe(error) if isinstance(error, ValidationError) else str(error)
         ) from error
 
 
@@ -313,7 +301,7 @@ def save_baseline(path: Path, baseline: Baseline) -> str:
     Raises:
         StateError: the disk is full or the folder not writable.
     """
-    file = StateFile(path)
+    file = storage.StateFile(path)
     document = baseline_to_json(baseline)
     pairs = {**_pairs_of(file.load().body), baseline.pair: document}
     try:
@@ -343,7 +331,7 @@ def load_baselines(path: Path) -> dict[str, Baseline]:
     return {pair: baseline_from_json(document) for pair, document in _documents(path).items()}
 
 
-def baseline_of_rig(rig: Rig, state: StateConfig) -> Baseline | None:
+def baseline_of_rig(rig: Rig, state: config.StateConfig) -> Baseline | None:
     """The baseline of a rig: the one learned when it was commissioned, else the one of its vehicle model if the
     configuration names a file for that; None if there is neither.
 
@@ -389,7 +377,7 @@ def baseline_from_json(values: object) -> Baseline:
 
 
 def _documents(path: Path) -> dict[str, Any]:
-    loaded = StateFile(path).load()
+    loaded = storage.StateFile(path).load()
     if loaded.body is None and loaded.damage:
         raise StateError(f"{path} cannot be used: {'; '.join(loaded.damage)}; commission again")
     return _pairs_of(loaded.body)

@@ -27,7 +27,6 @@ from dataclasses import dataclass, field
 from coec.config import BudgetConfig, MonitorConfig, WindowConfig
 from coec.service.timing import DriveClock, TokenBucket
 from coec.service.worker import worker_jobs
-from coec.service.worker.worker_jobs import Cost
 
 COST_SAMPLES = 9
 """How many measurements are kept; their median is the price. Outliers (other load on the machine, a new process, a hard
@@ -438,7 +437,7 @@ class Budget:
         with self._scheduling() as scheduler:
             scheduler.release(pair)
 
-    def pay(self, cost: Cost) -> None:
+    def pay(self, cost: worker_jobs.Cost) -> None:
         """Books the cost of the worker's work, for a pair that has joined or for none. Windows of earlier runs,
         pictures and commissionings are not for the stream: they appear in the report, but no check waits until they
         are earned."""

@@ -23,12 +23,10 @@ from coec.io.ros.wire_format import STATIC, Qos
 from coec.io.system import ServiceThread
 from coec.io.zenoh.ros_node import RosPublisher, RosPublishers
 from coec.schemas import keys
-from coec.schemas.keys import ros_name
 from coec.schemas.replies import ExtrinsicReply, HealthReply
 from coec.schemas.rig_state import RigReply
 from coec.service.worker import worker_jobs
 from coec.service.worker.supervisor import Worker
-from coec.service.worker.worker_jobs import JobOutcome, RenderedImage
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +98,7 @@ class CalibratedFrames:
         """Name of the frame to publish; None if every possible one has another parent already."""
         if self._ros.replace_camera_frames:
             return None if shared else camera
-        own = f"{camera}_{ros_name(pair)}" if shared else camera
+        own = f"{camera}_{keys.ros_name(pair)}" if shared else camera
         return f"{own}{self._ros.calibrated_suffix}"
 
 
@@ -144,10 +142,10 @@ class CheckPictures:
             self._requested_s[pair] = now_s
         return True
 
-    def _on_rendered(self, pair: str, stamp_ns: int, frame_id: str, outcome: JobOutcome) -> None:
+    def _on_rendered(self, pair: str, stamp_ns: int, frame_id: str, outcome: worker_jobs.JobOutcome) -> None:
         with self._lock:
             self._under_way.discard(pair)
-        if isinstance(outcome.answer, RenderedImage):
+        if isinstance(outcome.answer, worker_jobs.RenderedImage):
             self._topics[pair].put(encode_jpeg(stamp_ns, frame_id, outcome.answer.jpeg), time.time_ns())
 
 

@@ -30,7 +30,6 @@ from coec.io.rig_files import intrinsics_config
 from coec.service.ingest.pair_stream import frame_bytes
 from coec.service.worker import worker_jobs
 from coec.service.worker.supervisor import Worker, WorkerState
-from coec.service.worker.worker_jobs import JobOutcome
 from coec_lab.bench import scene
 
 BYTES_PER_MB = 1e6
@@ -55,7 +54,7 @@ SOLVES: Mapping[str, CalibrationConfig] = {
 WRITTEN_BYTES_PER_S = 35e6
 """A camera of half a megabyte and a LiDAR of three at 10 Hz, every frame written."""
 
-Outcomes = queue.SimpleQueue[JobOutcome]
+Outcomes = queue.SimpleQueue[worker_jobs.JobOutcome]
 
 
 class ProcessReading:

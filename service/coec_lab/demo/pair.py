@@ -31,7 +31,6 @@ from coec.io.rig_files import mask_to_png
 from coec.io.zenoh.query_client import connected, fetch_window
 from coec.reports import console
 from coec.reports.commented_yaml import commented_yaml
-from coec.reports.console import COMPILING, COMPILING_S, CompilationProgress
 from coec.reports.formatting import count
 from coec.schemas.keys import Keys
 from coec_lab.demo import pair_client, pair_report
@@ -203,7 +202,7 @@ class Screen:
     def __init__(self) -> None:
         self._live = Live(console=console.err, transient=True, auto_refresh=False)
         self._last_line = ""
-        self._news = CompilationProgress(time.monotonic)
+        self._news = console.CompilationProgress(time.monotonic)
         self._compiling_shown = False
 
     def __enter__(self) -> Screen:
@@ -216,15 +215,15 @@ class Screen:
     def on_compiling(self, kernel: str) -> None:
         """Called by `compile_news` when a kernel is being compiled in this process."""
         self._news.on_kernel(kernel)
-        if self._news.lasted_s >= COMPILING_S:
-            self._compiling(f"{COMPILING}: {self._news.kernels} so far, {self._news.lasted_s:.0f} s")
+        if self._news.lasted_s >= console.COMPILING_S:
+            self._compiling(f"{console.COMPILING}: {self._news.kernels} so far, {self._news.lasted_s:.0f} s")
 
     def _compiling(self, text: str) -> None:
         if console.err.is_terminal:
             self.show_text(text)
         elif not self._compiling_shown:
             self._compiling_shown = True
-            console.say(f"demo: {COMPILING}; the drive begins then")
+            console.say(f"demo: {console.COMPILING}; the drive begins then")
 
     def show_text(self, what: str) -> None:
         """Shows a text while there is nothing to see yet."""
@@ -237,7 +236,7 @@ class Screen:
             self._live.update(view(observer, snapshot), refresh=True)
             return
         moment = snapshot.moment
-        if snapshot.status.worker.state == STARTING and moment.t_s > COMPILING_S:
+        if snapshot.status.worker.state == STARTING and moment.t_s > console.COMPILING_S:
             self._compiling("")
             return
         line = f"{moment.health}, {moment.provenance}"

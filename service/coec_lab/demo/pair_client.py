@@ -16,20 +16,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import zenoh
 
+from coec import config
 from coec.calibration.types import Frame, Matrix4, Rig
-from coec.config import (
-    BudgetConfig,
-    CameraConfig,
-    Config,
-    EgoConfig,
-    LidarConfig,
-    MonitorConfig,
-    PairConfig,
-    StateConfig,
-    WindowConfig,
-    WorkerConfig,
-    ZenohConfig,
-)
 from coec.errors import NotFoundError, RemoteError
 from coec.geometry import se3
 from coec.io.recordings import window_cutting
@@ -293,8 +281,8 @@ CLOSE_UP_PX = (170, 285, 400, 170)
 PAIR_HZ, EGO_HZ = 1.0, 50.0
 """Frames per second of driving: only as many pairs are rendered as the service would select."""
 
-WINDOW = WindowConfig(pairs=12, min_pairs=8, slice_s=24.0)
-MONITOR = MonitorConfig(period_s=5.0, pairs=5, min_pairs=4, urgent_slice_s=12.0)
+WINDOW = config.WindowConfig(pairs=12, min_pairs=8, slice_s=24.0)
+MONITOR = config.MonitorConfig(period_s=5.0, pairs=5, min_pairs=4, urgent_slice_s=12.0)
 """Shorter than on a vehicle, where a window takes three minutes, which is too long to watch."""
 
 MAX_ERROR_DEG = 0.25
@@ -343,29 +331,29 @@ def drive_config() -> DriveConfig:
     )
 
 
-def service_config(rig: Rig, mask: Path, endpoint: str) -> Config:
+def service_config(rig: Rig, mask: Path, endpoint: str) -> config.Config:
     """Configuration of the service: defaults, except for rig, address, and what is shorter than on a vehicle."""
     streams = StreamKeys.default(rig.pair)
-    pair = PairConfig(
+    pair = config.PairConfig(
         name=rig.pair,
-        camera=CameraConfig(
+        camera=config.CameraConfig(
             key=streams.camera,
             frame_id=rig.camera_frame,
             intrinsics=intrinsics_config(rig.camera),
             mask=mask,
         ),
-        lidar=LidarConfig(key=streams.lidar, frame_id=rig.lidar_frame),
-        ego=EgoConfig(key=str(streams.ego), T_lidar_ego=matrix_rows(rig.T_lidar_ego)),
+        lidar=config.LidarConfig(key=streams.lidar, frame_id=rig.lidar_frame),
+        ego=config.EgoConfig(key=str(streams.ego), T_lidar_ego=matrix_rows(rig.T_lidar_ego)),
         T_camera_lidar=matrix_rows(rig.T_camera_lidar_nominal),
         window=WINDOW,
         monitor=MONITOR,
     )
-    return Config(
-        budget=BudgetConfig(cores=STORY_CORES),
-        zenoh=ZenohConfig(connect=(endpoint,), listen=(endpoint,)),
-        state=StateConfig(directory=Path("state"), min_free_bytes=MIN_FREE_BYTES),
+    return config.Config(
+        budget=config.BudgetConfig(cores=STORY_CORES),
+        zenoh=config.ZenohConfig(connect=(endpoint,), listen=(endpoint,)),
+        state=config.StateConfig(directory=Path("state"), min_free_bytes=MIN_FREE_BYTES),
         # The solver competes with rendering here; on a vehicle cameras take no processor time.
-        worker=WorkerConfig(niceness=0),
+        worker=config.WorkerConfig(niceness=0),
         pairs=(pair,),
     )
 

@@ -16,7 +16,6 @@ from coec_lab.experiments import evaluation_charts, objective_scans, plots, solv
 from coec_lab.experiments.evaluation_charts import bullseye
 from coec_lab.experiments.evaluation_schema import FramesPoint, SlicePoint
 from coec_lab.experiments.evaluation_tables import setting, verdict
-from coec_lab.experiments.solve_experiments import SUBSETS, Bench
 from coec_lab.experiments.solve_statistics import NormalisedErrors, SolveOutcome
 
 LANDSCAPE = (
@@ -47,7 +46,7 @@ class EvaluationBlocks:
 
 def write(
     folder: Path,
-    bench: Bench,
+    bench: solve_experiments.Bench,
     of_starts: Starts,
     outcomes: Sequence[SolveOutcome],
     frames: Sequence[FramesPoint],
@@ -73,10 +72,10 @@ def write(
     rate = f"{hits} of {len(outcomes)} starts hit, from {of_starts}"
     user_files.write_output(folder / "bullseye.png", plots.bullseye(outcomes, spheres, f"{title}\n{rate}"))
     if frames:
-        about = f"{title} and fewer\n{SUBSETS} subsets of each size, from {of_starts}"
+        about = f"{title} and fewer\n{solve_experiments.SUBSETS} subsets of each size, from {of_starts}"
         user_files.write_output(folder / "frames.png", plots.error_against_frames(frames, dof == 6, about))
     if slices:
-        about = f"{title} in all\n{SUBSETS} solves of each length, from {of_starts}"
+        about = f"{title} in all\n{solve_experiments.SUBSETS} solves of each length, from {of_starts}"
         user_files.write_output(folder / "slices.png", plots.error_against_slice(slices, dof == 6, about))
     seen = write_landscape(folder, bench, title, on_progress)
     ends = (bullseye({"": outcomes}, spheres), Text((LANDSCAPE,), quiet=True), evaluation_charts.landscape(seen))
@@ -107,7 +106,7 @@ def write_normalised(folder: Path, name: str, errors: Mapping[str, NormalisedErr
 
 
 def write_landscape(
-    folder: Path, bench: Bench, title: str, on_progress: Callable[[int, str], None]
+    folder: Path, bench: solve_experiments.Bench, title: str, on_progress: Callable[[int, str], None]
 ) -> Mapping[str, objective_scans.Views]:
     """Writes profiles.png, the fused objective and its cues about the reference, and returns what it shows."""
     window = replace(bench.window, T_camera_lidar_start=bench.reference)
@@ -118,7 +117,7 @@ def write_landscape(
     return seen
 
 
-def _write_worst(folder: Path, bench: Bench, outcomes: Sequence[SolveOutcome]) -> tuple[Block, ...]:
+def _write_worst(folder: Path, bench: solve_experiments.Bench, outcomes: Sequence[SolveOutcome]) -> tuple[Block, ...]:
     index = solve_statistics.worst(outcomes)
     outcome = outcomes[index]
     start_deg = window_cutting.rotation_error_deg(outcome.trial.start, bench.reference)

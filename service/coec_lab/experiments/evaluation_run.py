@@ -18,7 +18,6 @@ from coec.io.depth.depth_maps import open_depth
 from coec.io.recordings import window_cutting
 from coec.io.recordings.layouts import open_source
 from coec.io.recordings.recording_source import HasGroundTruth
-from coec.io.recordings.window_cutting import with_thinned_pairs
 from coec.recording import CallbackProgress, Recording, fit_camera
 from coec.recording import Window as PublicWindow
 from coec.reports.page_parts import finite_degrees
@@ -27,11 +26,6 @@ from coec_lab.experiments import evaluation_documents, mount_steps, solve_experi
 from coec_lab.experiments.detection import require_enough
 from coec_lab.experiments.evaluation_schema import DetectionReport, EvaluationReport, FramesPoint, SlicePoint, StepRow
 from coec_lab.experiments.solve_experiments import Bench, Stages
-from coec_lab.experiments.solve_statistics import (
-    Halves,
-    NormalisedErrors,
-    SolveOutcome,
-)
 
 MARGIN_DEG, MARGIN_M = 5.0, 0.2
 REACH_MARGIN_DEG, REACH_MARGIN_M = 3.0, 0.15
@@ -87,12 +81,12 @@ class Subject:
 class Experiments:
     """Outcomes of the experiments that were asked for. `interrupted`: some are missing."""
 
-    from_reference: SolveOutcome
-    outcomes: list[SolveOutcome] = field(default_factory=list)
+    from_reference: solve_statistics.SolveOutcome
+    outcomes: list[solve_statistics.SolveOutcome] = field(default_factory=list)
     frames: tuple[FramesPoint, ...] = ()
     slices: tuple[SlicePoint, ...] = ()
-    halves: Halves | None = None
-    normalised: dict[str, NormalisedErrors] = field(default_factory=dict)
+    halves: solve_statistics.Halves | None = None
+    normalised: dict[str, solve_statistics.NormalisedErrors] = field(default_factory=dict)
     detection: DetectionReport | None = None
     steps: tuple[StepRow, ...] = ()
     interrupted: bool = False
@@ -144,7 +138,7 @@ def subject_of(
     if camera_model is not None:
         window, _ = fit_camera(window, camera_model)
     if plan.steps and loaded.configuration is None:  # a recorded window brings the pairs between its own
-        window = with_thinned_pairs(window, open_source(source), WindowConfig())
+        window = window_cutting.with_thinned_pairs(window, open_source(source), WindowConfig())
     model = open_depth(configuration_of(plan, options, loaded.configuration).depth, LimitsConfig())
     depth = solve_experiments.inferred(window, model, stages.begin("depth", len(window.pairs)))
     return Subject(source, frames, window, model, depth, loaded.configuration, loaded.vehicle)

@@ -12,16 +12,7 @@ from typing import Literal
 
 from coec.reports import console
 from coec.reports.formatting import count
-from coec_lab.experiments.simulation_schemas import (
-    AxisStatistics,
-    GroupStatistics,
-    MatrixReport,
-    MatrixRow,
-    SolvedWindow,
-    SolveStatistics,
-    Watched,
-    WatchStatistics,
-)
+from coec_lab.experiments import simulation_schemas
 
 HIT_DEG, HIT_M = 0.5, 0.10
 """A hit is at most this far from the truth."""
@@ -29,7 +20,7 @@ WRONG_DEG, WRONG_M, WRONG_SIGMAS = 0.3, 0.10, 4.0
 """An accepted window is wrong on an axis where it is off by more than this and by more than `WRONG_SIGMAS` sigmas."""
 AXES: tuple[Literal["rx", "ry", "rz", "tx", "ty", "tz"], ...] = ("rx", "ry", "rz", "tx", "ty", "tz")
 DOFS: tuple[Literal[3, 6], ...] = (3, 6)
-PROPERTIES: dict[str, Callable[[MatrixRow], str]] = {
+PROPERTIES: dict[str, Callable[[simulation_schemas.MatrixRow], str]] = {
     "scene": lambda row: row.scene,
     "lens": lambda row: row.lens,
     "lidar": lambda row: row.lidar,
@@ -37,7 +28,7 @@ PROPERTIES: dict[str, Callable[[MatrixRow], str]] = {
     "fault": lambda row: row.fault,
 }
 
-Solves = list[tuple[MatrixRow, int, SolvedWindow]]
+Solves = list[tuple[simulation_schemas.MatrixRow, int, simulation_schemas.SolvedWindow]]
 """Windows, each with its drive and its place there."""
 
 
@@ -46,7 +37,7 @@ def is_hit(rotation_deg: float, translation_m: float, dof: int) -> bool:
     return rotation_deg <= HIT_DEG and (dof == 3 or translation_m <= HIT_M)
 
 
-def report(rows: Sequence[MatrixRow]) -> MatrixReport:
+def report(rows: Sequence[simulation_schemas.MatrixRow]) -> simulation_schemas.MatrixReport:
     """All figures of the rows, in the order of `rows`."""
     solves = [of_solves(dof, _solves(rows, dof)) for dof in DOFS if any(str(dof) in row.windows for row in rows)]
     moves = dict.fromkeys(watch.moved for row in rows for watch in row.watched)
@@ -54,7 +45,7 @@ def report(rows: Sequence[MatrixRow]) -> MatrixReport:
         of_watches(moved, [(row.name, watch) for row in rows for watch in row.watched if watch.moved == moved])
         for moved in moves
     ]
-    return MatrixReport(
+    return simulation_schemas.MatrixReport(
         drives=len(rows),
         failed={row.name: row.failure for row in rows if row.failure is not None},
         solves=tuple(solves),
@@ -63,11 +54,11 @@ def report(rows: Sequence[MatrixRow]) -> MatrixReport:
     )
 
 
-def of_solves(dof: Literal[3, 6], solves: Solves) -> SolveStatistics:
+def of_solves(dof: Literal[3, 6], solves: Solves) -> simulation_schemas.SolveStatistics:
     """Figures of the windows solved with one number of degrees of freedom."""
     accepted = [window for _, _, window in solves if window.accepted]
     wrong = [text for row, place, window in solves for text in wrong_axes(f"{row.name}#{place + 1}", window)]
-    return SolveStatistics(
+    return simulation_schemas.SolveStatistics(
         dof=dof,
         windows=len(solves),
         hits=sum(window.hit for _, _, window in solves),
@@ -81,14 +72,14 @@ def of_solves(dof: Literal[3, 6], solves: Solves) -> SolveStatistics:
     )
 
 
-def of_axis(axis: int, windows: Iterable[SolvedWindow]) -> AxisStatistics:
+def of_axis(axis: int, windows: Iterable[simulation_schemas.SolvedWindow]) -> simulation_schemas.AxisStatistics:
     """Errors on one axis against the claimed sigmas."""
     both = [(window.error[axis], window.sigma[axis]) for window in windows]
     known = [(error, sigma) for error, sigma in both if error is not None and sigma is not None and sigma > 0.0]
     errors, sigmas = [error for error, _ in known], [sigma for _, sigma in known]
     normalised = normalised_errors(axis, windows)
     rms, mean_sigma = _rms(errors), _mean(sigmas)
-    return AxisStatistics(
+    return simulation_schemas.AxisStatistics(
         axis=AXES[axis],
         windows=len(known),
         bias=_mean(errors),
@@ -102,13 +93,13 @@ def of_axis(axis: int, windows: Iterable[SolvedWindow]) -> AxisStatistics:
     )
 
 
-def normalised_errors(axis: int, windows: Iterable[SolvedWindow]) -> list[float]:
+def normalised_errors(axis: int, windows: Iterable[simulation_schemas.SolvedWindow]) -> list[float]:
     """Errors on an axis divided by the claimed sigmas, of the windows that claim one."""
     both = [(window.error[axis], window.sigma[axis]) for window in windows]
     return [error / sigma for error, sigma in both if error is not None and sigma is not None and sigma > 0.0]
 
 
-def wrong_axes(name: str, window: SolvedWindow) -> list[str]:
+def wrong_axes(name: str, window: simulation_schemas.SolvedWindow) -> list[str]:
     """The axes on which an accepted window is wrong, each with its figures; none for a refused window."""
     if not window.accepted:
         return []
@@ -120,14 +111,16 @@ def wrong_axes(name: str, window: SolvedWindow) -> list[str]:
     return wrong
 
 
-def of_watches(moved: str, watches: Sequence[tuple[str, Watched]]) -> WatchStatistics:
+def of_watches(
+    moved: str, watches: Sequence[tuple[str, simulation_schemas.Watched]]
+) -> simulation_schemas.WatchStatistics:
     """Figures of all checks of one served pose; `watches` are given with the names of their drives."""
     usable = sum(watch.checks - watch.blind for _, watch in watches)
     hours = fsum(watch.seconds for _, watch in watches) / 3600.0
     alarms = sum(watch.alarms for _, watch in watches)
     delays = [watch.delay_checks for _, watch in watches if watch.delay_checks is not None]
     right = moved == "right"
-    return WatchStatistics(
+    return simulation_schemas.WatchStatistics(
         moved=moved,
         drives=len(watches),
         checks=sum(watch.checks for _, watch in watches),
@@ -142,17 +135,17 @@ def of_watches(moved: str, watches: Sequence[tuple[str, Watched]]) -> WatchStati
     )
 
 
-def _solves(rows: Sequence[MatrixRow], dof: Literal[3, 6]) -> Solves:
+def _solves(rows: Sequence[simulation_schemas.MatrixRow], dof: Literal[3, 6]) -> Solves:
     key: Literal["3", "6"] = "3" if dof == 3 else "6"
     return [(row, place, window) for row in rows for place, window in enumerate(row.windows.get(key, ()))]
 
 
-def _groups(solves: Solves) -> Iterable[GroupStatistics]:
+def _groups(solves: Solves) -> Iterable[simulation_schemas.GroupStatistics]:
     for of, value_of in PROPERTIES.items():
         for value in dict.fromkeys(value_of(row) for row, _, _ in solves):
             some = [solve for solve in solves if value_of(solve[0]) == value]
             rotations_deg = [window.rotation_deg for _, _, window in some if window.rotation_deg is not None]
-            yield GroupStatistics(
+            yield simulation_schemas.GroupStatistics(
                 of=of,
                 value=value,
                 windows=len(some),
@@ -179,7 +172,7 @@ def _within(normalised: Sequence[float], sigmas: float) -> float | None:
     return sum(abs(value) <= sigmas for value in normalised) / len(normalised) if normalised else None
 
 
-def show(report: MatrixReport) -> None:
+def show(report: simulation_schemas.MatrixReport) -> None:
     """Prints the drives one by one, then the figures over all of them."""
     for solves in report.solves:
         _show_drives(report, solves)
@@ -190,7 +183,7 @@ def show(report: MatrixReport) -> None:
         console.show(f"no result: {name}: {failure}", "red")
 
 
-def _show_drives(report: MatrixReport, solves: SolveStatistics) -> None:
+def _show_drives(report: simulation_schemas.MatrixReport, solves: simulation_schemas.SolveStatistics) -> None:
     console.show(f"{solves.dof} degrees of freedom", "bold")
     table = console.table("drive", "start", "error deg", "± σ", "error m", "± σ", "", right=range(1, 6))
     for row in report.rows:
@@ -207,19 +200,19 @@ def _show_drives(report: MatrixReport, solves: SolveStatistics) -> None:
     console.out.print(table)
 
 
-def _decision(window: SolvedWindow) -> str:
+def _decision(window: simulation_schemas.SolvedWindow) -> str:
     if window.failure is not None:
         return f"no estimate: {window.failure}"
     hit = "hit" if window.hit else "miss"
     return f"accepted {hit}" if window.accepted else f"refused {hit}: {', '.join(window.reasons)}"
 
 
-def _largest(window: SolvedWindow, axes: range) -> float | None:
+def _largest(window: simulation_schemas.SolvedWindow, axes: range) -> float | None:
     known = [sigma for axis in axes if (sigma := window.sigma[axis]) is not None]
     return max(known) if known else None
 
 
-def _show_solves(solves: SolveStatistics) -> None:
+def _show_solves(solves: simulation_schemas.SolveStatistics) -> None:
     console.show(
         f"{solves.dof} dof: {count(solves.windows, 'window')}, {count(solves.hits, 'hit')}, {solves.accepted} accepted "
         f"({solves.accepted_hits} of them hits), {solves.accepted_wrong} accepted and wrong",
@@ -248,7 +241,7 @@ def _show_solves(solves: SolveStatistics) -> None:
     console.show(f"refused for: {', '.join(f'{code} {count}' for code, count in solves.reasons.items()) or 'nothing'}")
 
 
-def _show_watched(watched: tuple[WatchStatistics, ...]) -> None:
+def _show_watched(watched: tuple[simulation_schemas.WatchStatistics, ...]) -> None:
     table = console.table(
         "served pose", "drives", "checks", "flagged", "blind", "alarmed", "alarms/h", "delay", right=range(1, 8)
     )

@@ -13,20 +13,9 @@ from math import radians
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration import types
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.pipeline import calibrate
-from coec.calibration.types import (
-    MOUNT_RAD,
-    MOVED,
-    Decision,
-    DepthModel,
-    Estimate,
-    FramePair,
-    ImageReader,
-    Matrix4,
-    Silence,
-    Window,
-)
 from coec.config import CalibrationConfig
 from coec.errors import CalibrationError
 from coec.geometry import se3
@@ -102,9 +91,9 @@ class MountStepTrial:
 
 
 def try_mount_steps(
-    window: Window,
-    depth: DepthModel,
-    images: ImageReader,
+    window: types.Window,
+    depth: types.DepthModel,
+    images: types.ImageReader,
     config: CalibrationConfig,
     trials: int,
     knocks: Sequence[MountStep],
@@ -119,7 +108,7 @@ def try_mount_steps(
     if len(window.pairs) < 2:
         raise CalibrationError(f"a step lies between two pairs of a window, there are {len(window.pairs)}")
     pairs, between = (_compensated(of, window, config) for of in (window.pairs, window.between))
-    still = replace(window, pairs=pairs, between=between, start_known_to_rad=MOUNT_RAD)
+    still = replace(window, pairs=pairs, between=between, start_known_to_rad=types.MOUNT_RAD)
     config = config.model_copy(update={"motion_compensation": False})
     # Each recording has knocks of its own, so that many recordings show many knocks.
     recording_hash = zlib.crc32(window.pairs[0].camera.image.data)
@@ -159,9 +148,9 @@ def table(tried: Sequence[MountStepTrial]) -> tuple[StepRow, ...]:
 
 def _try(
     knock: MountStep,
-    still: Window,
-    depth: DepthModel,
-    images: ImageReader,
+    still: types.Window,
+    depth: types.DepthModel,
+    images: types.ImageReader,
     config: CalibrationConfig,
     rng: np.random.Generator,
 ) -> MountStepTrial:
@@ -171,7 +160,7 @@ def _try(
     at_ns = int(rng.integers(still.pairs[first_late - 1].stamp_ns, still.pairs[first_late].stamp_ns))
     begin_ns, length_ns = still.pairs[0].stamp_ns, still.stamp_ns - still.pairs[0].stamp_ns
 
-    def displaced(pairs: Sequence[FramePair]) -> tuple[FramePair, ...]:
+    def displaced(pairs: Sequence[types.FramePair]) -> tuple[types.FramePair, ...]:
         if knock.creeps:
             return tuple(_moved(pair, start, xi * ((pair.stamp_ns - begin_ns) / length_ns)) for pair in pairs)
         return tuple(_moved(pair, start, xi * (pair.stamp_ns > at_ns)) for pair in pairs)
@@ -179,12 +168,12 @@ def _try(
     moved = replace(still, pairs=displaced(still.pairs), between=displaced(still.between))
     late = 1 - first_late / count
     try:
-        estimate = calibrate(moved, depth, images, config, Silence())
+        estimate = calibrate(moved, depth, images, config, types.Silence())
     except CalibrationError:
         return MountStepTrial(
             knock.name, accepted=False, wrong=False, moved=False, off_s=None, interval_s=None, holds=None, late=late
         )
-    accepted = estimate.verdict.decision is Decision.ACCEPTED
+    accepted = estimate.verdict.decision is types.Decision.ACCEPTED
     off_s = interval_s = holds = None
     if (motion := estimate.moved) is not None and knock.moves and not knock.creeps:
         off_s = abs((motion.last_before_ns + motion.first_after_ns) // 2 - at_ns) / NS_PER_S
@@ -194,7 +183,7 @@ def _try(
         knock.name,
         accepted,
         accepted and _is_wrong(estimate, se3.perturb(start, xi)),
-        any(reason.code == MOVED for reason in estimate.verdict.reasons),
+        any(reason.code == types.MOVED for reason in estimate.verdict.reasons),
         off_s,
         interval_s,
         holds,
@@ -207,24 +196,26 @@ def _median(values: Sequence[float | None]) -> float | None:
     return float(np.median([one for one in values if one is not None])) if values else None
 
 
-def _compensated(pairs: Sequence[FramePair], window: Window, config: CalibrationConfig) -> tuple[FramePair, ...]:
+def _compensated(
+    pairs: Sequence[types.FramePair], window: types.Window, config: CalibrationConfig
+) -> tuple[types.FramePair, ...]:
     """The pairs with their sweeps compensated to the instants of the exposures."""
 
-    def of(pair: FramePair) -> FramePair:
+    def of(pair: types.FramePair) -> types.FramePair:
         xyz_m = compensate(pair, window.rig, enabled=config.motion_compensation)
         return replace(pair, lidar=replace(pair.lidar, xyz_m=xyz_m))
 
     return tuple(of(pair) for pair in pairs)
 
 
-def _moved(pair: FramePair, T_camera_lidar: Matrix4, xi: NDArray[np.float64]) -> FramePair:
+def _moved(pair: types.FramePair, T_camera_lidar: types.Matrix4, xi: NDArray[np.float64]) -> types.FramePair:
     """The pair as if the mount were moved by ξ (6,) from `T_camera_lidar` (4, 4)."""
     carried = (se3.inverse(se3.perturb(T_camera_lidar, xi)) @ T_camera_lidar).astype(np.float32)
     xyz_m = pair.lidar.xyz_m @ carried[:3, :3].T + carried[:3, 3]
     return replace(pair, lidar=replace(pair.lidar, xyz_m=np.ascontiguousarray(xyz_m)))
 
 
-def _is_wrong(estimate: Estimate, truth: Matrix4) -> bool:
+def _is_wrong(estimate: types.Estimate, truth: types.Matrix4) -> bool:
     """Judges the rotation alone, because every window has to find it."""
     error = se3.difference(estimate.optimum.T_camera_lidar, truth)
     sigma_rad = float(np.max(estimate.sigma[:3]))

@@ -15,20 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration import types
 from coec.calibration.pipeline import calibrate
-from coec.calibration.types import (
-    CameraFrame,
-    Decision,
-    EncodedImage,
-    Estimate,
-    FramePair,
-    ImageFormat,
-    LidarFrame,
-    Matrix4,
-    Rig,
-    Silence,
-    Window,
-)
 from coec.calibration_options import SolverOptions
 from coec.config import CalibrationConfig, LimitsConfig, WindowConfig
 from coec.errors import CalibrationError
@@ -111,7 +99,7 @@ class Reference:
         offset: (6,) from the recording's calibration, rad and m.
     """
 
-    T_camera_lidar: Matrix4
+    T_camera_lidar: types.Matrix4
     accepted: int
     solved: int
     offset: NDArray[np.float64]
@@ -188,23 +176,23 @@ class ResampledSolve:
 
 
 @lru_cache(maxsize=2)
-def _loaded(source: str) -> Window:
+def _loaded(source: str) -> types.Window:
     """All frames of a recording, with pixels that need no decoding."""
     window = load_window(source, None, WindowConfig().pairs, lambda *_: None).window
     limits = LimitsConfig()
 
-    def decoded(pair: FramePair) -> FramePair:
+    def decoded(pair: types.FramePair) -> types.FramePair:
         return replace(pair, camera=replace(pair.camera, image=_raw(decode_bgr(pair.camera.image, limits))))
 
     return replace(window, pairs=tuple(map(decoded, window.pairs)))
 
 
-def _raw(bgr: NDArray[np.uint8]) -> EncodedImage:
+def _raw(bgr: NDArray[np.uint8]) -> types.EncodedImage:
     height, width = bgr.shape[:2]
-    return raw_image(ImageFormat.BGR8, width, height, np.ascontiguousarray(bgr).tobytes(), LimitsConfig())
+    return raw_image(types.ImageFormat.BGR8, width, height, np.ascontiguousarray(bgr).tobytes(), LimitsConfig())
 
 
-def sampled(window: Window, lens_errors: bool, rng: np.random.Generator) -> Sample:
+def sampled(window: types.Window, lens_errors: bool, rng: np.random.Generator) -> Sample:
     """A window out of another one."""
     available, camera = len(window.pairs), window.rig.camera
     count = int(rng.integers(min(LEAST_FRAMES, available), available + 1))
@@ -234,7 +222,7 @@ def _sampled_lens(rng: np.random.Generator) -> LensError:
     return LensError(kind, float(np.exp(rng.uniform(log(least), log(most))) * rng.choice([-1.0, 1.0])))
 
 
-def resampled(window: Window, sample: Sample) -> Window:
+def resampled(window: types.Window, sample: Sample) -> types.Window:
     """The window that was drawn out of a window of raw images."""
     rig, (left, top, width, height) = window.rig, sample.part
     camera = cameras.cropped(rig.camera, left, top, width, height)
@@ -255,7 +243,7 @@ def resampled(window: Window, sample: Sample) -> Window:
     return replace(window, rig=replace(rig, camera=camera, mask=mask), pairs=pairs, between=())
 
 
-def _part(frame: CameraFrame, sample: Sample, width: int, height: int, rig: Rig) -> CameraFrame:
+def _part(frame: types.CameraFrame, sample: Sample, width: int, height: int, rig: types.Rig) -> types.CameraFrame:
     left, top, columns, rows = sample.part
     bgr = decode_bgr(frame.image, LimitsConfig())[top : top + rows, left : left + columns]
     if sample.halved:
@@ -267,13 +255,13 @@ def _part(frame: CameraFrame, sample: Sample, width: int, height: int, rig: Rig)
         codes = codes[
             round(top * down) : round((top + rows) * down), round(left * across) : round((left + columns) * across)
         ]
-        depth = EncodedImage(
-            ImageFormat.PNG, codes.shape[1], codes.shape[0], encode_depth_png(np.ascontiguousarray(codes))
+        depth = types.EncodedImage(
+            types.ImageFormat.PNG, codes.shape[1], codes.shape[0], encode_depth_png(np.ascontiguousarray(codes))
         )
     return replace(frame, image=_raw(bgr), depth=depth)
 
 
-def _with_fewer_rings(sweep: LidarFrame, sample: Sample) -> LidarFrame:
+def _with_fewer_rings(sweep: types.LidarFrame, sample: Sample) -> types.LidarFrame:
     if sample.ring_step == 1:
         return sweep
     ring = np.floor(bearings(sweep.xyz_m).elevation / RING_RAD) if sweep.ring is None else sweep.ring
@@ -301,7 +289,7 @@ def consensus(of: Resampling) -> Reference:
         offset = se3.difference(estimate.optimum.T_camera_lidar, nominal)
         if np.linalg.norm(offset[:3]) < FARTHEST_RAD and np.linalg.norm(offset[3:]) < FARTHEST_M:
             solved.append(offset)
-            if estimate.verdict.decision is Decision.ACCEPTED:
+            if estimate.verdict.decision is types.Decision.ACCEPTED:
                 accepted.append(offset)
     offset = np.median(accepted or solved or [np.zeros(6)], axis=0)
     return Reference(se3.perturb(nominal, offset), len(accepted), len(solved), offset)
@@ -324,22 +312,24 @@ def solve_resampled(task: tuple[int, Resampling, Reference]) -> list[ResampledSo
     return solves
 
 
-def _solved(window: Window, start: Matrix4, depth: CachedDepth, configuration: CalibrationConfig) -> Estimate | None:
+def _solved(
+    window: types.Window, start: types.Matrix4, depth: CachedDepth, configuration: CalibrationConfig
+) -> types.Estimate | None:
     guess = replace(window, T_camera_lidar_start=start, start_known_to_rad=pi)
     try:
-        return calibrate(guess, depth, GreyImages(LimitsConfig()), configuration, Silence())
+        return calibrate(guess, depth, GreyImages(LimitsConfig()), configuration, types.Silence())
     except CalibrationError:
         return None
 
 
-def _scored(number: int, sample: Sample, estimate: Estimate | None, reference: Matrix4) -> ResampledSolve:
+def _scored(number: int, sample: Sample, estimate: types.Estimate | None, reference: types.Matrix4) -> ResampledSolve:
     if estimate is None:
         unknown = np.full(6, np.nan)
         return ResampledSolve(number, sample, unknown, unknown, accepted=False, reasons=("not_solved",))
     error = se3.difference(estimate.optimum.T_camera_lidar, reference)
     # Axes that stayed at the start are no result.
     error[~estimate.solved] = np.nan
-    accepted = estimate.verdict.decision is Decision.ACCEPTED
+    accepted = estimate.verdict.decision is types.Decision.ACCEPTED
     reasons = tuple(reason.code for reason in estimate.verdict.reasons)
     return ResampledSolve(number, sample, error, estimate.sigma, accepted, reasons)
 

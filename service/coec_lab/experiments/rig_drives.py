@@ -14,6 +14,8 @@ from math import degrees, isfinite, radians
 import numpy as np
 from numpy.typing import NDArray
 
+from coec import config
+from coec.calibration import types
 from coec.calibration.frames.window import TRIES
 from coec.calibration.monitor.change_detector import MonitorOutcome, MonitorState, Observation
 from coec.calibration.monitor.check import check_at, join, seen_part
@@ -34,31 +36,9 @@ from coec.calibration.state import (
     urgent_window_since,
 )
 from coec.calibration.tracker import Measurement
-from coec.calibration.types import (
-    MOUNT_RAD,
-    Decision,
-    DepthModel,
-    FramePair,
-    LidarFrame,
-    Matrix4,
-    Rig,
-    Silence,
-    Uncertainty,
-    Window,
-)
-from coec.config import (
-    CalibrationConfig,
-    DepthConfig,
-    LimitsConfig,
-    MonitorConfig,
-    PolicyConfig,
-    TrackerConfig,
-    WindowConfig,
-)
 from coec.errors import CoecError
 from coec.geometry import se3
 from coec.geometry.points import random_direction
-from coec.geometry.se3 import inverse
 from coec.io.depth.depth_maps import open_depth
 from coec.io.images import CachedGreys, GreyImages
 from coec.reports.close_ups import evenly
@@ -99,20 +79,20 @@ def due(instants: int, pairs: Sequence[str]) -> tuple[str, ...]:
 class SeenPair:
     """A pair of frames with its prepared sweep."""
 
-    frames: FramePair
+    frames: types.FramePair
     sweep: PreparedSweep
 
 
-def observe(rig: Rig, pose: Matrix4, seen: Sequence[SeenPair]) -> Observation:
+def observe(rig: types.Rig, pose: types.Matrix4, seen: Sequence[SeenPair]) -> Observation:
     """A look at an uncommissioned pair that serves `pose` (4, 4); edges alone decide, so no depth is inferred.
 
     Raises:
         CalibrationError: an image cannot be decoded.
     """
     pairs, sweeps = tuple(one.frames for one in seen), [one.sweep for one in seen]
-    window = Window(f"{rig.pair}-{pairs[-1].stamp_ns}", rig, pose, pairs)
-    images = CachedGreys(GreyImages(LimitsConfig()), len(pairs))
-    window_data = prepare_window_data(window, _no_depth(), images, CalibrationConfig(), Silence())
+    window = types.Window(f"{rig.pair}-{pairs[-1].stamp_ns}", rig, pose, pairs)
+    images = CachedGreys(GreyImages(config.LimitsConfig()), len(pairs))
+    window_data = prepare_window_data(window, _no_depth(), images, config.CalibrationConfig(), types.Silence())
     part = seen_part(rig, sweeps, pose, OUTLINE_RAD)
     upright = rig.T_camera_lidar_nominal[:2, 2]
     pictures = prepare_images(window_data.greys(), len(pairs), rig.camera, rig.mask, upright, part, part)
@@ -123,7 +103,7 @@ def observe(rig: Rig, pose: Matrix4, seen: Sequence[SeenPair]) -> Observation:
 def graph_of(drive: RigDrive, lidar: str) -> RigGraph:
     """All cameras of a drive with one of its LiDARs, at their nominal mounts; each edge is named after its pair."""
     sensors = [Sensor(lidar, SensorKind.LIDAR), *(Sensor(camera, SensorKind.CAMERA) for camera in drive.cameras)]
-    T_ego_lidar = inverse(drive.T_sensor_ego_nominal(lidar))
+    T_ego_lidar = se3.inverse(drive.T_sensor_ego_nominal(lidar))
     edges = [
         Edge(f"{camera}-{lidar}", camera, lidar, product(drive.T_sensor_ego_nominal(camera), T_ego_lidar))
         for camera in drive.cameras
@@ -132,9 +112,9 @@ def graph_of(drive: RigDrive, lidar: str) -> RigGraph:
 
 
 @cache
-def _no_depth() -> DepthModel:
+def _no_depth() -> types.DepthModel:
     """A depth model that is never asked: edges alone decide."""
-    return open_depth(DepthConfig(model="stereo"), LimitsConfig())
+    return open_depth(config.DepthConfig(model="stereo"), config.LimitsConfig())
 
 
 LIDAR = "roof"
@@ -206,7 +186,7 @@ class DisplacedRigDrive:
         return graph_of(self.right, LIDAR)
 
     @cached_property
-    def served(self) -> dict[str, Matrix4]:
+    def served(self) -> dict[str, types.Matrix4]:
         """Served extrinsic (4, 4) of each pair: off the truth by as much as windows are (`WINDOW`)."""
         rng = np.random.default_rng([FIRST_SEED, self.number, 1])
         return {edge.name: se3.perturb(edge.T_a_b, WINDOW * rng.normal(size=6)) for edge in self.graph.edges}
@@ -219,8 +199,8 @@ class DisplacedRigDrive:
 
 
 NS_PER_S = 1_000_000_000
-MONITOR = MonitorConfig(period_s=PERIOD_S, pairs=CHECK_PAIRS)
-RULES = PairRules(PolicyConfig(), TrackerConfig(), MONITOR)
+MONITOR = config.MonitorConfig(period_s=PERIOD_S, pairs=CHECK_PAIRS)
+RULES = PairRules(config.PolicyConfig(), config.TrackerConfig(), MONITOR)
 
 SOLVE_S = 4.5
 """The worker takes four seconds for a window of 25 frames."""
@@ -229,13 +209,13 @@ WAITING = {Mounts.AS_BUILT: 1, Mounts.CAMERA: 2, Mounts.LIDAR: 4}
 """How many windows the worker solves one after the other: those of both knocked cameras, or of all pairs of the LiDAR.
 Each counts once all are solved."""
 
-CONFIGURATION = CalibrationConfig()
+CONFIGURATION = config.CalibrationConfig()
 
-FramesByMount = Mapping[tuple[str, Mounts], Sequence[FramePair]]
+FramesByMount = Mapping[tuple[str, Mounts], Sequence[types.FramePair]]
 """The pairs of a drive by camera, and by which of their sensors has moved since the knock, ascending."""
 
 
-def pair_at(pose: Matrix4) -> PairState:
+def pair_at(pose: types.Matrix4) -> PairState:
     """A pair that serves `pose` (4, 4), which a window has confirmed."""
     return PairState(
         pose, Provenance.ESTIMATED, CalibrationStatus.ACCEPTED, START_NS, monitor=MonitorState(vouched=True)
@@ -264,7 +244,7 @@ def urgent_windows(drive: DisplacedRigDrive, frames: FramesByMount, checks: Sequ
         for begin_ns in request_stamps_ns(drive.served[edge], variant(checks, edge, mounts), late_ns):
             of_slice = [pair for pair in pairs if begin_ns < pair.stamp_ns <= begin_ns + SLICE_S * NS_PER_S]
             if pairs[-1].stamp_ns >= begin_ns + late_ns:
-                selected = tuple(of_slice[index] for index in evenly(len(of_slice), WindowConfig().pairs))
+                selected = tuple(of_slice[index] for index in evenly(len(of_slice), config.WindowConfig().pairs))
                 yield _solved(drive, camera, mounts, selected, begin_ns + late_ns)
 
 
@@ -273,7 +253,7 @@ def answer_ns(mounts: Mounts) -> int:
     return round((SLICE_S + WAITING[mounts] * SOLVE_S) * NS_PER_S)
 
 
-def request_stamps_ns(pose: Matrix4, checks: Iterator[RigLook], late_ns: int) -> Iterator[int]:
+def request_stamps_ns(pose: types.Matrix4, checks: Iterator[RigLook], late_ns: int) -> Iterator[int]:
     """When a pair that serves `pose` (4, 4) asks for a window: at most `TRIES` times per suspicion, and not again
     before the answer, which comes `late_ns` after it."""
     pair, tries, known_ns = pair_at(pose), 0, START_NS
@@ -289,13 +269,15 @@ def request_stamps_ns(pose: Matrix4, checks: Iterator[RigLook], late_ns: int) ->
 
 
 def _solved(
-    drive: DisplacedRigDrive, camera: str, mounts: Mounts, pairs: tuple[FramePair, ...], known_ns: int
+    drive: DisplacedRigDrive, camera: str, mounts: Mounts, pairs: tuple[types.FramePair, ...], known_ns: int
 ) -> RigWindow:
     rig = drive.right.pair(camera, LIDAR).rig
     pose = drive.served[rig.pair]
-    window = Window(f"{rig.pair}-{pairs[0].stamp_ns}", rig, pose, pairs, MOUNT_RAD)
-    images = CachedGreys(GreyImages(LimitsConfig()), len(pairs))
-    estimate = calibrate(window, open_depth(CONFIGURATION.depth, LimitsConfig()), images, CONFIGURATION, Silence())
+    window = types.Window(f"{rig.pair}-{pairs[0].stamp_ns}", rig, pose, pairs, types.MOUNT_RAD)
+    images = CachedGreys(GreyImages(config.LimitsConfig()), len(pairs))
+    estimate = calibrate(
+        window, open_depth(CONFIGURATION.depth, config.LimitsConfig()), images, CONFIGURATION, types.Silence()
+    )
     uncertainty = Measurement.from_estimate(estimate).uncertainty
     document = {
         "edge": rig.pair,
@@ -303,7 +285,7 @@ def _solved(
         "first_ns": pairs[0].stamp_ns,
         "last_ns": pairs[-1].stamp_ns,
         "known_ns": known_ns,
-        "accepted": estimate.verdict.decision is Decision.ACCEPTED,
+        "accepted": estimate.verdict.decision is types.Decision.ACCEPTED,
         "reasons": [one.code for one in estimate.verdict.reasons],
         "offset": se3.difference(estimate.optimum.T_camera_lidar, pose).tolist(),
         "noise": [[value if isfinite(value) else None for value in row] for row in uncertainty.noise.tolist()],
@@ -312,13 +294,13 @@ def _solved(
     return RigWindow.model_validate(document)
 
 
-def window_evidence(window: RigWindow, pose: Matrix4) -> EdgeObservation | None:
+def window_evidence(window: RigWindow, pose: types.Matrix4) -> EdgeObservation | None:
     """An accepted window of a pair that served `pose` (4, 4) as attribution takes it; None if it determines no axis.
     All of its frames lie after a step only if the first one does."""
     noise = np.array([[np.nan if value is None else value for value in row] for row in window.noise])
     systematic = {name: np.array(shift) for name, shift in window.systematic.items()}
     measured = Measurement(
-        se3.perturb(pose, np.array(window.offset)), Uncertainty(noise, systematic, np.nan), window.last_ns
+        se3.perturb(pose, np.array(window.offset)), types.Uncertainty(noise, systematic, np.nan), window.last_ns
     )
     evidence = observation_of_window(window.edge, measured)
     return None if evidence is None else replace(evidence, stamp_ns=window.first_ns)
@@ -398,10 +380,10 @@ def _seen(drive: DisplacedRigDrive, instant: Instant) -> dict[tuple[str, Mounts]
     motions = tuple(right.message(entry) for entry in instant.motions)
     seen_pairs: dict[tuple[str, Mounts], SeenPair] = {}
     sweep = right.message(instant.sweep)
-    assert isinstance(sweep, LidarFrame)
+    assert isinstance(sweep, types.LidarFrame)
     of_sweep = prepare_sweep(sweep)
     moved = displaced.message(instant.sweep) if _is_after(drive, instant.sweep.stamp_ns) else None
-    of_moved = prepare_sweep(moved) if isinstance(moved, LidarFrame) else None
+    of_moved = prepare_sweep(moved) if isinstance(moved, types.LidarFrame) else None
     for camera, entry in instant.pictures.items():
         picture = right.message(entry)
         seen_pairs |= _joined((camera, Mounts.AS_BUILT), pair_of(picture, sweep, motions), of_sweep)
@@ -413,7 +395,7 @@ def _seen(drive: DisplacedRigDrive, instant: Instant) -> dict[tuple[str, Mounts]
 
 
 def _joined(
-    key: tuple[str, Mounts], frames: FramePair | None, sweep: PreparedSweep
+    key: tuple[str, Mounts], frames: types.FramePair | None, sweep: PreparedSweep
 ) -> dict[tuple[str, Mounts], SeenPair]:
     return {} if frames is None else {key: SeenPair(frames, sweep)}
 

@@ -21,7 +21,6 @@ from coec.calibration.baseline import FLOOR, PRIOR_SPREAD_POSE, PRIOR_SPREAD_ROT
 from coec.calibration.frames.window import TRIES
 from coec.calibration.monitor.sequential_tests import WEAK_TIMES
 from coec.calibration.rig import edge_observations
-from coec.calibration.rig.edge_observations import REACH, EdgeObservation, information_of, observation_of_window
 from coec.calibration.rig.graph import Edge, RigGraph, Sensor, SensorKind
 from coec.calibration.tracker import Measurement
 from coec.calibration.types import Matrix4, Uncertainty
@@ -190,7 +189,7 @@ class Happening:
         return still and bool(rng.random() < BLIND)
 
 
-TimedEvidence = tuple[float, EdgeObservation]
+TimedEvidence = tuple[float, edge_observations.EdgeObservation]
 """The time at which a look becomes known, s, and the look."""
 
 
@@ -221,7 +220,7 @@ def _checks(edge: Edge, drive: Happening, biased: float, rng: np.random.Generato
         scatter = CHECK * (WEAK_TIMES if faint else 1.0)
         seen = drive.where(edge, at) + bias + poor * (street + _student(scatter, rng))
         if not in_run or rng.random() >= SAME:
-            bad = REACH * rng.normal(size=6)
+            bad = edge_observations.REACH * rng.normal(size=6)
         in_run = bool(rng.random() < (BAD_LASTS if in_run else BAD))
         if in_run or (faint and rng.random() < FAINT_BAD):
             seen = bad + CHECK * rng.normal(size=6)
@@ -248,7 +247,7 @@ def _lidar_checks(edge: Edge, drive: Happening, at_s: float, rng: np.random.Gene
         sigma = _varied(LIDAR_CHECK, rng)
         seen = drive.where(edge, at_s) + bias + street + _student(sigma, rng)
         if rng.random() < BAD:
-            seen = REACH * rng.normal(size=6)
+            seen = edge_observations.REACH * rng.normal(size=6)
         if not blind and rng.random() >= MISSING:
             T_a_b = se3.perturb(edge.T_a_b, seen)
             check = edge_observations.observation_of_registration(
@@ -278,12 +277,12 @@ def _poor(rng: np.random.Generator) -> float:
 
 def _check_evidence(
     edge: Edge, at_s: float, xi: Array, scatter: Array, faint: bool, suspected_ns: int | None
-) -> EdgeObservation:
-    return EdgeObservation(
+) -> edge_observations.EdgeObservation:
+    return edge_observations.EdgeObservation(
         edge=edge.name,
         stamp_ns=round(at_s * NS_PER_S),
         T_a_b=se3.perturb(edge.T_a_b, xi),
-        information=information_of(np.diag(scatter**2)),
+        information=edge_observations.information_of(np.diag(scatter**2)),
         place=STREET,
         rig=UNCOMMISSIONED_BIAS,
         weak=faint,
@@ -393,7 +392,7 @@ def _of_pair(
         # A window during which the mount moved is refused.
         if rng.random() < ACCEPTED and np.array_equal(offset_at_start, offset_at_end):
             measured = window_of(se3.perturb(edge.T_a_b, offset_at_end), lasting.lens[edge.a], rng)
-            window_evidence = observation_of_window(edge.name, measured)
+            window_evidence = edge_observations.observation_of_window(edge.name, measured)
             assert window_evidence is not None
             evidence.append((known_s, replace(window_evidence, stamp_ns=round(at_s * NS_PER_S))))
     return evidence

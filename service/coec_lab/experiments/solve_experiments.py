@@ -27,7 +27,6 @@ from coec_lab.experiments.detection import TriedCheck, try_detection
 from coec_lab.experiments.evaluation_documents import frames_point, slice_point
 from coec_lab.experiments.evaluation_schema import FramesPoint, SlicePoint
 from coec_lab.experiments.mount_steps import MOUNT_STEPS, MountStepTrial, try_mount_steps
-from coec_lab.experiments.solve_statistics import SolveOutcome, Trial
 
 GOLDEN_ANGLE_RAD = pi * (3.0 - sqrt(5.0))
 """The turn between neighbours of a Fibonacci lattice (Á. González, "Measurement of areas on a sphere using Fibonacci
@@ -151,7 +150,7 @@ class Bench:
         """The source's calibration, (4, 4)."""
         return self.window.rig.T_camera_lidar_nominal
 
-    def solve(self, start: Matrix4, frames: Sequence[int] | None = None) -> SolveOutcome:
+    def solve(self, start: Matrix4, frames: Sequence[int] | None = None) -> solve_statistics.SolveOutcome:
         """Solves from one start, which is taken as a guess, on all frames or on those with the given indices."""
         pairs = self.window.pairs if frames is None else tuple(self.window.pairs[index] for index in frames)
         window = replace(self.window, T_camera_lidar_start=start, start_known_to_rad=pi, pairs=pairs)
@@ -160,7 +159,7 @@ class Bench:
             estimate = calibrate(window, self.depth, self.images, self.configuration, Silence())
         except CalibrationError:
             estimate = None
-        trial = Trial(start, estimate, time.perf_counter() - began_s)
+        trial = solve_statistics.Trial(start, estimate, time.perf_counter() - began_s)
         return solve_statistics.score(trial, self.reference, self.configuration.search.dof)
 
 
@@ -185,7 +184,7 @@ def greys_of(window: Window) -> ImageReader:
     return CachedGreys(GreyImages(LimitsConfig()), len(window.pairs) + len(window.between))
 
 
-def from_reference(bench: Bench, stages: Stages) -> SolveOutcome:
+def from_reference(bench: Bench, stages: Stages) -> solve_statistics.SolveOutcome:
     """The solve that starts at the reference, the best of all starts. It also compiles the kernels, so that the other
     solves are timed without compiling.
 
@@ -200,7 +199,7 @@ def from_reference(bench: Bench, stages: Stages) -> SolveOutcome:
     return outcome
 
 
-def from_starts(bench: Bench, poses: Sequence[Matrix4], stages: Stages) -> Iterator[SolveOutcome]:
+def from_starts(bench: Bench, poses: Sequence[Matrix4], stages: Stages) -> Iterator[solve_statistics.SolveOutcome]:
     """One solve from each of the poses (4, 4), yielded as soon as it is done."""
     on_progress = stages.begin("starts", len(poses))
     hits = 0
@@ -258,7 +257,7 @@ def against_slice(
                 # A slice without a camera frame is no window.
                 continue
             slices.append(window)
-        outcomes: list[tuple[int, list[SolveOutcome]]] = []
+        outcomes: list[tuple[int, list[solve_statistics.SolveOutcome]]] = []
         for place, window in enumerate(slices):
             of_slice = replace(
                 bench, window=window, depth=inferred(window, model, lambda *_: None), images=greys_of(window)
@@ -277,7 +276,7 @@ def against_slice(
 
 def in_halves(
     bench: Bench, splits: int, rotation_rad: float, translation_m: float, stages: Stages
-) -> list[tuple[SolveOutcome, SolveOutcome]]:
+) -> list[tuple[solve_statistics.SolveOutcome, solve_statistics.SolveOutcome]]:
     """Solves disjoint halves of the frames, each from another start, this far from the reference."""
     available = len(bench.window.pairs)
     poses = start_poses(bench.reference, 2 * splits, rotation_rad, translation_m)
@@ -297,7 +296,7 @@ def in_windows(
     poses: Sequence[Matrix4],
     true_pose: Callable[[int], Matrix4],
     stages: Stages,
-) -> list[SolveOutcome]:
+) -> list[solve_statistics.SolveOutcome]:
     """Cuts the recording into as many consecutive windows as there are starts; they share no frame. Each is solved from
     its start and compared with `true_pose` at the time of its last pair (ns). Windows without a camera frame are left
     out.

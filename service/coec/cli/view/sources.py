@@ -23,7 +23,6 @@ from coec.calibration.types import FramePair, Matrix4, Rig
 from coec.config import Config, LimitsConfig, PairConfig, PairingConfig
 from coec.errors import DecodeError, SourceError
 from coec.geometry import se3
-from coec.geometry.se3 import is_rigid
 from coec.io import viewer_scene
 from coec.io.foxglove import ViewerServer
 from coec.io.logs import LossCounter
@@ -83,7 +82,7 @@ def load_candidate(path: Path) -> Candidate:
     except DecodeError as error:
         raise SourceError(f"{path} is not the result of `coec calibrate --json`: {error}") from error
     T_camera_lidar = matrix_of(result.camera_from_lidar)
-    if not is_rigid(T_camera_lidar):
+    if not se3.is_rigid(T_camera_lidar):
         raise SourceError(f"{path}: camera_from_lidar is not a rigid transform")
     return Candidate(result, T_camera_lidar)
 
@@ -557,7 +556,7 @@ class ServiceWatch:
 
 def _rigid(transform: Transform) -> Matrix4:
     T_camera_lidar = matrix_of(transform)
-    if not is_rigid(T_camera_lidar):
+    if not se3.is_rigid(T_camera_lidar):
         raise DecodeError("message_fields", "the matrix is not a rigid transform")
     return T_camera_lidar
 

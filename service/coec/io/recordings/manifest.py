@@ -22,20 +22,11 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 from ruamel.yaml.nodes import CollectionNode, MappingNode, Node
 
+from coec import config
 from coec.calibration import types
 from coec.calibration.frames import sweep_evidence
 from coec.calibration.frames.lidar_origin import ApparentOrigin, SeveralOrigins
 from coec.calibration.search.mistakes import INVERSE_POSE
-from coec.config import (
-    IDENTITY,
-    CameraIntrinsics,
-    FilePath,
-    LimitsConfig,
-    Name,
-    PointTimeConfig,
-    describe,
-    load_yaml,
-)
 from coec.config.model import ConfigModel
 from coec.config.pair import Pose, with_direction
 from coec.errors import ConfigError, DecodeError, OutputError, SourceError, UsageError
@@ -43,17 +34,9 @@ from coec.geometry import cameras, se3
 from coec.geometry.cameras import Camera
 from coec.io.images import encode_depth_png, probe, raw_image
 from coec.io.intrinsics_files import cameras_of, load_camera_document, with_camera
-from coec.io.recordings import bag_recognition
+from coec.io.recordings import bag_recognition, recording_source
 from coec.io.recordings.cloud_files import MAX_COLUMNS, CloudLayout, load_cloud, measured_from
 from coec.io.recordings.kitti import load_image
-from coec.io.recordings.recording_source import (
-    FramewiseRecording,
-    RecordedFrame,
-    SourceSpec,
-    evenly_spread,
-    is_bag,
-    parse_spec,
-)
 from coec.io.rig_files import camera_of, load_mask
 from coec.io.user_files import read_bytes, read_npy, write_output
 
@@ -79,30 +62,30 @@ class TwistDocument(ConfigModel):
 class FrameDocument(ConfigModel):
     """One image and its cloud; paths are relative to the manifest."""
 
-    image: FilePath
-    cloud: FilePath
+    image: config.FilePath
+    cloud: config.FilePath
     stamp_ns: int = Field(ge=0, lt=_MAX_STAMP_NS)
     cloud_stamp_ns: int | None = Field(default=None, ge=0, lt=_MAX_STAMP_NS)
-    depth: FilePath | None = None
+    depth: config.FilePath | None = None
     twist: TwistDocument | None = None
 
 
 class ManifestDocument(ConfigModel):
     """The whole of `dataset.yaml`."""
 
-    pair: Name
-    camera: CameraIntrinsics
-    mask: FilePath | None = None
+    pair: config.Name
+    camera: config.CameraIntrinsics
+    mask: config.FilePath | None = None
     T_camera_lidar: Pose
     T_cloud_lidar: Pose = Field(
-        default=IDENTITY, description="pose of the LiDAR in the frame in which the points are given"
+        default=config.IDENTITY, description="pose of the LiDAR in the frame in which the points are given"
     )
     cloud_columns: tuple[Annotated[str, Field(max_length=64)], ...] = Field(
         default=(),
         max_length=MAX_COLUMNS,
         description="names of the columns of .bin and .npy, _ for one that is unused",
     )
-    cloud_time: PointTimeConfig | None = Field(
+    cloud_time: config.PointTimeConfig | None = Field(
         default=None, description="how the points of .pcd, .ply, .bin and .npy are timed, if their values leave it open"
     )
     compensated: Literal[False, "no", "stamp", "begin", "middle", "end"] | None = Field(
@@ -124,7 +107,7 @@ class ManifestDocument(ConfigModel):
         return names
 
 
-def open_manifest(spec: SourceSpec) -> FramewiseRecording:
+def open_manifest(spec: recording_source.SourceSpec) -> recording_source.FramewiseRecording:
     """Opens a folder with a `dataset.yaml`, or such a file.
 
     Raises:
@@ -163,7 +146,7 @@ def open_manifest(spec: SourceSpec) -> FramewiseRecording:
         for frame in frames
         if frame.twist is not None
     ]
-    recording = FramewiseRecording(
+    recording = recording_source.FramewiseRecording(
         f"{path.parent.name}/{document.pair}",
         rig,
         T_camera_lidar,
@@ -201,17 +184,17 @@ def _read(path: Path) -> tuple[ManifestDocument, Camera, NDArray[np.bool_] | Non
         camera = camera_of(document.camera)
         mask = None if document.mask is None else load_mask(path.parent / document.mask, camera)
     except ValidationError as error:
-        raise SourceError(f"{path}: {describe(error)}") from error
+        raise SourceError(f"{path}: {config.describe(error)}") from error
     except ConfigError as error:
         raise SourceError(f"{path}: {error}") from error
     return document, camera, mask
 
 
-def _compensated(recording: FramewiseRecording) -> tuple[str | None, types.Recognition | None]:
+def _compensated(recording: recording_source.FramewiseRecording) -> tuple[str | None, types.Recognition | None]:
     """See `bag_recognition.compensated`, of some sweeps at which the vehicle is known to drive."""
     driving = {m.stamp_ns for m in recording.motions if m.reaches(sweep_evidence.LEAST_SPEED_MPS)}
     moving = [frame for frame in recording.frames if frame.camera_stamp_ns in driving]
-    sampled = [moving[index] for index in evenly_spread(len(moving), bag_recognition.SAMPLED_SWEEPS)]
+    sampled = [moving[index] for index in recording_source.evenly_spread(len(moving), bag_recognition.SAMPLED_SWEEPS)]
     sweeps = (frame.load_lidar() for frame in sampled)
     return bag_recognition.compensated(sweeps, recording.motions, np.eye(4), "`compensated: no` in the dataset.yaml")
 
@@ -263,9 +246,9 @@ def _cloud_stamp_ns(frame: FrameDocument) -> int:
 
 def _recorded(
     folder: Path, frame: FrameDocument, scale: _DepthScale, T_cloud_lidar: types.Matrix4, layout: CloudLayout
-) -> RecordedFrame:
+) -> recording_source.RecordedFrame:
     cloud_stamp_ns = _cloud_stamp_ns(frame)
-    return RecordedFrame(
+    return recording_source.RecordedFrame(
         frame.stamp_ns,
         partial(_load_camera, folder, frame, scale),
         cloud_stamp_ns,
@@ -295,7 +278,7 @@ def _load_any_image(path: Path) -> types.EncodedImage:
     """JPEG and PNG files as they are; any other image that OpenCV can read as raw 8-bit pixels."""
     data = read_bytes(path)
     try:
-        return probe(data, LimitsConfig())
+        return probe(data, config.LimitsConfig())
     except DecodeError as error:
         if error.reason != "image_unknown_format":
             raise SourceError(f"{path}: {error}") from error
@@ -306,7 +289,7 @@ def _load_any_image(path: Path) -> types.EncodedImage:
     if pixels is None:
         raise SourceError(f"{path} is not an image that OpenCV reads")
     height, width = pixels.shape[:2]
-    return raw_image(types.ImageFormat.BGR8, width, height, pixels.tobytes(), LimitsConfig())
+    return raw_image(types.ImageFormat.BGR8, width, height, pixels.tobytes(), config.LimitsConfig())
 
 
 class _DepthScale:
@@ -335,7 +318,7 @@ class _DepthScale:
         values = _load_float_map(path)
         share = (np.where(_has_value(values), values, self._least) - self._least) / (self._span or 1.0)
         codes = np.where(_has_value(values), 1 + np.rint(np.clip(share, 0.0, 1.0) * _DEPTH_CODES), 0)
-        return probe(encode_depth_png(codes.astype(np.uint16)), LimitsConfig())
+        return probe(encode_depth_png(codes.astype(np.uint16)), config.LimitsConfig())
 
 
 def _has_value(values: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -346,7 +329,7 @@ def _load_float_map(path: Path) -> NDArray[np.floating]:
     values = read_npy(path)
     if values.ndim != 2 or values.dtype.kind != "f" or not values.size:
         raise SourceError(f"{path}: a depth map must be a float array of shape (height, width)")
-    if values.size > LimitsConfig().max_image_pixels:
+    if values.size > config.LimitsConfig().max_image_pixels:
         raise SourceError(f"{path}: {values.shape} is larger than any depth map")
     return np.asarray(values, dtype=np.float64)
 
@@ -376,15 +359,15 @@ def manifest_of(source: str) -> Path:
     """
     if not has_manifest(source):
         raise UsageError(f"--fix writes a corrected {FILE_NAME}, and {source} has none")
-    path = parse_spec(source).path
+    path = recording_source.parse_spec(source).path
     return path / FILE_NAME if path.is_dir() else path
 
 
 def has_manifest(source: str) -> bool:
     """Whether a SOURCE argument names a manifest, or a folder with one."""
-    spec = parse_spec(source)
+    spec = recording_source.parse_spec(source)
     is_manifest = spec.path.suffix in (".yaml", ".yml") or (spec.path / FILE_NAME).is_file()
-    return spec.layout is None and not is_bag(spec) and is_manifest
+    return spec.layout is None and not recording_source.is_bag(spec) and is_manifest
 
 
 def write_corrected(path: Path, mistake: types.Mistake, camera: Camera, T_camera_lidar: types.Matrix4) -> Correction:
@@ -417,7 +400,7 @@ def write_corrected(path: Path, mistake: types.Mistake, camera: Camera, T_camera
         raise OutputError(f"{corrected} exists and is another: move it away first")
     write_output(corrected, text.encode())
     try:
-        load_yaml(corrected)
+        config.load_yaml(corrected)
     except ConfigError as error:
         corrected.unlink()
         raise OutputError(f"{path} cannot be corrected without changing its form: {error}") from error

@@ -13,16 +13,7 @@ from itertools import accumulate
 from typing import Literal, get_args
 
 from coec.calibration.state_machine import HealthState
-from coec.schemas.replies import (
-    BudgetStatus,
-    CheckReply,
-    HealthReply,
-    Maybe6,
-    MetricReply,
-    PairStatus,
-    StatusReply,
-    StreamStatus,
-)
+from coec.schemas import replies
 from coec.schemas.rig_state import RigReply, SensorState
 from coec.service.api.reply_builders import AXES, UNITS
 from coec.service.api.uplink import Uplink
@@ -70,8 +61,8 @@ class MetricsInput:
         uplink: counts of the evidence that went out.
     """
 
-    status: StatusReply
-    health: Mapping[str, HealthReply]
+    status: replies.StatusReply
+    health: Mapping[str, replies.HealthReply]
     memory_bytes: int = 0
     worker_memory_bytes: int = 0
     durations: Mapping[str, Sequence[LabelledHistogram]] = field(default_factory=dict)
@@ -160,15 +151,17 @@ def _of_uplink(name: str, text: str, counts: Callable[[Uplink], Mapping[str, int
     )
 
 
-def _of_budget(name: str, text: str, value: Callable[[BudgetStatus], float]) -> Family:
+def _of_budget(name: str, text: str, value: Callable[[replies.BudgetStatus], float]) -> Family:
     return _single(name, text, lambda view: None if view.status.budget is None else value(view.status.budget))
 
 
-def _of_pair(name: str, text: str, value: Callable[[PairStatus], float], kind: Kind = "counter") -> Family:
+def _of_pair(name: str, text: str, value: Callable[[replies.PairStatus], float], kind: Kind = "counter") -> Family:
     return Family(name, kind, text, ("pair",), lambda view: (((one.name,), value(one)) for one in view.status.pairs))
 
 
-def _counts_of_pair(name: str, text: str, label: str, counts: Callable[[PairStatus], Mapping[str, int]]) -> Family:
+def _counts_of_pair(
+    name: str, text: str, label: str, counts: Callable[[replies.PairStatus], Mapping[str, int]]
+) -> Family:
     return Family(
         name,
         "counter",
@@ -178,7 +171,9 @@ def _counts_of_pair(name: str, text: str, label: str, counts: Callable[[PairStat
     )
 
 
-def _of_stream(name: str, text: str, value: Callable[[StreamStatus], float | None], kind: Kind = "counter") -> Family:
+def _of_stream(
+    name: str, text: str, value: Callable[[replies.StreamStatus], float | None], kind: Kind = "counter"
+) -> Family:
     def samples(view: MetricsInput) -> Iterable[MetricSample]:
         for pair in view.status.pairs:
             for stream, status in (("camera", pair.camera), ("lidar", pair.lidar), ("ego", pair.ego)):
@@ -187,28 +182,30 @@ def _of_stream(name: str, text: str, value: Callable[[StreamStatus], float | Non
     return Family(name, kind, text, ("pair", "stream"), samples)
 
 
-def _of_health(name: str, text: str, value: Callable[[HealthReply], float | None], kind: Kind = "gauge") -> Family:
+def _of_health(
+    name: str, text: str, value: Callable[[replies.HealthReply], float | None], kind: Kind = "gauge"
+) -> Family:
     return Family(
         name, kind, text, ("pair",), lambda view: (((pair,), value(reply)) for pair, reply in view.health.items())
     )
 
 
-def _axes(choose: Callable[[HealthReply], Maybe6 | None], view: MetricsInput) -> Iterable[MetricSample]:
+def _axes(choose: Callable[[replies.HealthReply], replies.Maybe6 | None], view: MetricsInput) -> Iterable[MetricSample]:
     """Samples by pair, axis and unit."""
     for pair, reply in view.health.items():
         for axis, unit, value in zip(AXES, UNITS, choose(reply) or (), strict=False):
             yield (pair, axis, unit), value
 
 
-def _of_axis(name: str, text: str, choose: Callable[[HealthReply], Maybe6 | None]) -> Family:
+def _of_axis(name: str, text: str, choose: Callable[[replies.HealthReply], replies.Maybe6 | None]) -> Family:
     return Family(name, "gauge", text, ("pair", "axis", "unit"), lambda view: _axes(choose, view))
 
 
-def _of_check(name: str, text: str, choose: Callable[[CheckReply], Maybe6 | None]) -> Family:
+def _of_check(name: str, text: str, choose: Callable[[replies.CheckReply], replies.Maybe6 | None]) -> Family:
     return _of_axis(name, text, lambda reply: None if reply.check is None else choose(reply.check))
 
 
-def _derivative(name: str, text: str, choose: Callable[[CheckReply], Maybe6]) -> Family:
+def _derivative(name: str, text: str, choose: Callable[[replies.CheckReply], replies.Maybe6]) -> Family:
     """Samples by pair and axis, without the unit, which the help line names."""
     by_unit = _of_check(name, text, choose)
     return replace(
@@ -241,7 +238,7 @@ def _alarms(view: MetricsInput) -> Iterable[MetricSample]:
             yield (pair, "withdrawn"), reply.alarms.withdrawn
 
 
-def _figures(name: str, text: str, value: Callable[[MetricReply], float | None]) -> Family:
+def _figures(name: str, text: str, value: Callable[[replies.MetricReply], float | None]) -> Family:
     def samples(view: MetricsInput) -> Iterable[MetricSample]:
         for pair, reply in view.health.items():
             for figure, metric in sorted(reply.metrics.items()):

@@ -26,7 +26,6 @@ from coec.io.zenoh.bus import Answer
 from coec.schemas import replies
 from coec.schemas.commands import COMMAND_NAMES
 from coec.schemas.keys import Format
-from coec.schemas.replies import SnippetInfo, WindowInfo, WindowsReply
 from coec.service.api import problems, reply_builders
 from coec.service.discovery import info_topic_of
 from coec.service.discovery_listener import NominalStatus
@@ -40,15 +39,14 @@ from coec.service.records.pair_store import PairStore
 from coec.service.vehicle_context import VehicleContext
 from coec.service.worker import compilation, worker_jobs
 from coec.service.worker.supervisor import Worker
-from coec.service.worker.worker_jobs import JobOutcome, RenderedImage
 
 
 @dataclass(frozen=True, slots=True)
 class _CachedListing:
     """A listing, and the answers that were made of it."""
 
-    windows: tuple[WindowInfo, ...]
-    snippets: tuple[SnippetInfo, ...]
+    windows: tuple[replies.WindowInfo, ...]
+    snippets: tuple[replies.SnippetInfo, ...]
     answers: dict[Format, Answer] = field(default_factory=dict)
 
 
@@ -71,7 +69,7 @@ class WindowsList:
             listing = self._listing = _CachedListing(windows, snippets)
         answer = listing.answers.get(form)
         if answer is None:
-            reply = WindowsReply(vehicle=self._vehicle, pair=self._pair, windows=windows, snippets=snippets)
+            reply = replies.WindowsReply(vehicle=self._vehicle, pair=self._pair, windows=windows, snippets=snippets)
             answer = listing.answers[form] = reply_builders.answer_of(reply, form)
         return answer
 
@@ -134,11 +132,11 @@ class Overlays:
         """Asks for the picture without waiting. `done` is called once, with the picture or with the reason why there is
         none, at the latest after `deadline_s` if the worker is busy (None: the default of pictures)."""
 
-        def on_outcome(outcome: JobOutcome) -> None:
+        def on_outcome(outcome: worker_jobs.JobOutcome) -> None:
             match outcome:
-                case JobOutcome(answer=RenderedImage(jpeg)):
+                case worker_jobs.JobOutcome(answer=worker_jobs.RenderedImage(jpeg)):
                     done(jpeg)
-                case JobOutcome(reason=Reason() as reason):
+                case worker_jobs.JobOutcome(reason=Reason() as reason):
                     done(reason)
 
         self._worker.submit(worker_jobs.overlay(self._pair, path, T_camera_lidar, title, on_outcome, deadline_s))

@@ -27,7 +27,6 @@ from coec.io.zenoh.bus import JSON, MSGPACK, Answer
 from coec.schemas import replies
 from coec.schemas.keys import Format
 from coec.schemas.message import to_json, to_msgpack
-from coec.schemas.replies import CalibrationResult
 from coec.service.cpu_budget import BudgetReport
 from coec.service.engine.messages import PairSnapshot
 from coec.service.engine.pair import HELD
@@ -43,7 +42,7 @@ AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 UNITS: tuple[Literal["deg", "m"], ...] = ("deg", "deg", "deg", "m", "m", "m")
 
 
-def axes_of(result: CalibrationResult | None, status: CalibrationStatus) -> replies.Axes:
+def axes_of(result: replies.CalibrationResult | None, status: CalibrationStatus) -> replies.Axes:
     """Correction and standard deviation per axis, of a result or (None) of the nominal calibration."""
 
     def axis(index: int) -> replies.AxisReply:
@@ -59,7 +58,7 @@ def axes_of(result: CalibrationResult | None, status: CalibrationStatus) -> repl
     return replies.Axes(rx=axis(0), ry=axis(1), rz=axis(2), tx=axis(3), ty=axis(4), tz=axis(5))
 
 
-def _axis_status(result: CalibrationResult, index: int, status: CalibrationStatus) -> replies.AxisStatus:
+def _axis_status(result: replies.CalibrationResult, index: int, status: CalibrationStatus) -> replies.AxisStatus:
     if result.unobservable[index]:
         return "not_observable"
     return status.value if result.solved[index] else "not_solved"
@@ -69,7 +68,7 @@ def extrinsic_of(
     vehicle: str,
     rig: Rig,
     state: PairState,
-    accepted: CalibrationResult | None,
+    accepted: replies.CalibrationResult | None,
     percent_complete: float,
     config_hash: str,
 ) -> replies.ExtrinsicReply:
@@ -119,7 +118,7 @@ def uncertainty_of_served(state: PairState) -> Uncertainty | None:
     return state.accepted.uncertainty if state.track is None or state.track.windows <= 1 else state.track.uncertainty
 
 
-def axes_of_served(state: PairState, rig: Rig, accepted: CalibrationResult | None) -> replies.Axes:
+def axes_of_served(state: PairState, rig: Rig, accepted: replies.CalibrationResult | None) -> replies.Axes:
     """Correction and standard deviation per axis of what is served: those of the track if it holds more than one
     window."""
     axes = axes_of(accepted, CalibrationStatus.ACCEPTED)
@@ -211,7 +210,7 @@ def health_of(
     )
 
 
-def _lens_drift(result: CalibrationResult | None) -> replies.LensDrift | None:
+def _lens_drift(result: replies.CalibrationResult | None) -> replies.LensDrift | None:
     """The lens according to the latest window. Nothing applies it: the configuration has the intrinsics."""
     if result is None or result.lens is None:
         return None

@@ -37,7 +37,6 @@ from coec.service.ingest.decoder import EGO, LIDAR, SensorStream, Taker
 from coec.service.timing import NS_PER_S
 from coec.service.worker import worker_jobs
 from coec.service.worker.supervisor import Worker
-from coec.service.worker.worker_jobs import JobOutcome, Registered
 
 MAX_LIDAR_PAIRS = 6
 """How many combinations of two LiDARs are looked at, in the order of the configuration: all those of four LiDARs. Each
@@ -167,7 +166,7 @@ class RegistrationSubject:
     losses: Mapping[str, int]
 
 
-RegistrationRequest = Request[RegistrationSubject, JobOutcome, int]
+RegistrationRequest = Request[RegistrationSubject, worker_jobs.JobOutcome, int]
 """What a registration changes is how many are left out after it."""
 
 
@@ -199,7 +198,7 @@ class LidarPairStream:
             timed_b=b.lidar.sweep is not None,
         )
         self._sweep_sets: deque[lidar_sampling.SweepSet] = deque()
-        self._schedule: Schedule[RegistrationSubject, JobOutcome, int] = Schedule()
+        self._schedule: Schedule[RegistrationSubject, worker_jobs.JobOutcome, int] = Schedule()
         self._losses: Counter[str] = Counter()
         self._resting = 0
         self._missed = ""
@@ -320,7 +319,7 @@ class LidarPairStream:
         subject, outcome = request.subject, request.result
         assert outcome is not None
         answer = outcome.answer
-        if not isinstance(answer, Registered):
+        if not isinstance(answer, worker_jobs.Registered):
             reasons = () if outcome.reason is None else (outcome.reason,)
             return LidarPairReport(subject.stamp_ns, None, reasons, subject.losses), 0
         if answer.reasons:

@@ -23,7 +23,6 @@ from coec.io import storage
 from coec.io.logs import LossCounter
 from coec.io.mcap.windows import SUFFIX
 from coec.io.mcap.writer import PART_SUFFIX, REWRITE_SUFFIX, SnippetFile, metadata_of, salvage_snippet
-from coec.io.storage import read_piece
 from coec.schemas.message import from_json, to_json
 from coec.schemas.replies import SnippetInfo
 from coec.service.ingest.pair_stream import Snippet, frame_bytes
@@ -93,7 +92,7 @@ class SnippetStore:
             known = name in self._infos and _pair_of(name) == pair
         if not known:
             raise NotFoundError(f"pair {pair} has no snippet of this id; the list is in `windows`")
-        return read_piece(self.path(name), "the snippet", offset, length)
+        return storage.read_piece(self.path(name), "the snippet", offset, length)
 
     def add(self, info: SnippetInfo) -> None:
         """Lists a snippet that was recorded, once its description is on the disk and a restart would list it, too.

@@ -37,7 +37,6 @@ from coec.errors import DecodeError, StateError
 from coec.geometry.se3 import is_rigid
 from coec.io import storage
 from coec.io.serialise import matrix_of
-from coec.io.storage import BROKEN, AppendLog
 from coec.schemas.message import SCHEMA_VERSION, from_json, to_json
 from coec.schemas.replies import Book, CalibrationResult, ChainedEntry, CheckReply, HistoryEntry
 
@@ -77,7 +76,7 @@ class HashChain:
     def __init__(self, path: Path, limit: int, head: str | None = None) -> None:
         """`head` is the `durable_head` in the state file: a chain that does not reach it was cut off."""
         self._path = path
-        self._ledger: AppendLog[HistoryRecord] = AppendLog(path, limit, lambda record: record.line)
+        self._ledger: storage.AppendLog[HistoryRecord] = storage.AppendLog(path, limit, lambda record: record.line)
         self._writing = threading.Lock()
         self._to_quarantine = False
         self.damage: str | None = None
@@ -126,7 +125,7 @@ class HashChain:
         with self._writing:
             try:
                 if self._to_quarantine:
-                    storage.quarantine(self._path, BROKEN)
+                    storage.quarantine(self._path, storage.BROKEN)
                     self._to_quarantine = False
                 self._ledger.flush()
             except OSError as error:
@@ -326,7 +325,7 @@ class CheckLog:
     def __init__(self, path: Path, limit: int) -> None:
         """`path` holds the checks of earlier runs; the newest `limit` are kept."""
         self._path = path
-        self._ledger: AppendLog[CheckReply] = AppendLog(path, limit, to_json)
+        self._ledger: storage.AppendLog[CheckReply] = storage.AppendLog(path, limit, to_json)
         self._load()
 
     def checks(self) -> tuple[CheckReply, ...]:

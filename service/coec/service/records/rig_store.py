@@ -25,7 +25,6 @@ from coec.calibration.rig.attribution import RigState
 from coec.calibration.rig.edge_observations import MOST_SIGMA, EdgeHistory, information_of
 from coec.calibration.rig.graph import MOST_SENSORS
 from coec.calibration.rig.joint_estimate import PreMoveKnowledge
-from coec.calibration.rig.rig_estimator import MoveEvent, VehicleRig
 from coec.calibration.tracker import Measurement
 from coec.calibration.types import Estimate, Matrix4, Reason, Rig, Uncertainty
 from coec.config import CalibrationConfig, PairConfig, StateConfig
@@ -129,7 +128,7 @@ class RigStore:
         edges = [f"{unread} of {len(stored.edges)} edges"] if unread else []
         return edges if self._event is not None or stored.event is None else [*edges, "the move of a sensor"]
 
-    def restored(self, rig: VehicleRig) -> VehicleRig:
+    def restored(self, rig: rig_estimator.VehicleRig) -> rig_estimator.VehicleRig:
         """Adds to a fresh rig, before any look, what was known before the restart."""
         histories = dict(rig.believed.histories)
         for name, edge in rig.graph.edge.items():
@@ -142,12 +141,12 @@ class RigStore:
         if event is None or not set(event.sensors) <= set(rig.graph.place):
             return replace(rig, believed=RigState(histories))
         named = frozenset(event.named) & frozenset(event.sensors)
-        going_on = MoveEvent(event.sensors, event.since_ns, event.stepped_ns)
+        going_on = rig_estimator.MoveEvent(event.sensors, event.since_ns, event.stepped_ns)
         known = {name: _measurement(one) for name, one in event.before.items() if name in rig.graph.edge}
         believed = RigState(histories, stepped_ns=event.stepped_ns, named=named)
         return rig_estimator.resumed(replace(rig, believed=believed), going_on, PreMoveKnowledge(event.sensors, known))
 
-    def update(self, rig: VehicleRig) -> None:
+    def update(self, rig: rig_estimator.VehicleRig) -> None:
         """Keeps what is known; the next `flush` writes it."""
         edges = {}
         for name, edge in rig.graph.edge.items():
