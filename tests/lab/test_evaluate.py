@@ -165,7 +165,7 @@ def test_methods_side_by_side_as_text(coec: Coec, monkeypatch: pytest.MonkeyPatc
         "--objective", "all", "--halves", "1",
     )  # fmt: skip
     header = next(line for line in outcome.out.splitlines() if "fused" in line)
-    assert header.split() == ["fused", "mi", "unit"]
+    assert header.split() == ["fused", "mi", "Unit"]
     assert "intensity was not evaluated: " in outcome.out
     assert "1 split into halves of 1 frame:" in outcome.out
     assert not outcome.err
@@ -217,10 +217,10 @@ def test_text_separates_bias_from_noise_and_counts_verdicts(coec: Coec) -> None:
     outcome = coec(
         "evaluate", SMALL, "--depth", "stereo", "--objective", "mi", "--rotation-deg", "3", "--directions", "3"
     )
-    assert "3 starts 3° away" in outcome.out
-    assert "3 hits within 0.5 deg: 100.0 %" in outcome.out
-    assert "std of hits" in outcome.out
-    assert "classified correctly: 100.0 %" in outcome.out
+    assert "3 of 3 starts 3° away end within 0.5° of the source’s calibration (100.0 %)" in outcome.out
+    assert "100.0 % of the verdicts are right" in outcome.out
+    assert "Std of hits" in outcome.out
+    assert "Starts by verdict and by truth" in outcome.out
     assert not outcome.err
 
 
@@ -295,7 +295,7 @@ def test_displacements_are_projected_into_the_recording(coec: Coec, monkeypatch:
         "--steps", "2",
     )  # fmt: skip
     assert outcome.status == 0
-    assert "accepted and wrong" in " ".join(outcome.out.split())
+    assert "Accepted and wrong" in " ".join(outcome.out.split())
     assert any("3 deg" in line and " 2 " in line for line in outcome.out.splitlines()), "two windows"
 
 
@@ -358,7 +358,7 @@ def test_closure_misses_a_pose_by_what_it_is_off(coec: Coec, tmp_path: Path) -> 
 def test_closure_as_text(coec: Coec) -> None:
     outcome = coec(*CLOSURE, "--directions", "1", "--frames", "2")
     assert "two cameras, one LiDAR; A in the frame of B, as the recordings tell: 0.000 deg" in outcome.out
-    assert "errors against the known pose between both" in outcome.out
+    assert "Errors against the known pose between both" in outcome.out
     assert not outcome.err
 
 

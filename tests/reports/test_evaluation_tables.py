@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from coec.reports.page import render
-from coec_lab.experiments.evaluation_page import evaluation_page
-from coec_lab.experiments.evaluation_tables import reference_doubt, show
+from coec_lab.experiments.evaluation_page import evaluation_page, show
+from coec_lab.experiments.evaluation_tables import reference_doubt
 from reports.pages import MADE, evaluation_report
 
 OFF = (-0.8, 0.6, -0.5, 0.0, 0.0, 0.0)

@@ -28,6 +28,7 @@ from coec.reports import formatting
 from coec.untrusted import json_printable, printable, printable_lines
 
 if TYPE_CHECKING:
+    from coec.reports import page
     from coec.schemas import replies
 
 LINE_S = 30.0
@@ -206,6 +207,14 @@ STATE_STYLES = {
 }
 """A state that is not listed is neither good nor bad."""
 
+TONE_STYLES: Mapping[page.Tone, str] = {
+    "good": "bold green",
+    "unsure": "bold yellow",
+    "poor": "bold yellow",
+    "bad": "bold red",
+    "none": "bold",
+}
+
 PIPE_WIDTH = 140
 """Columns where standard output is no terminal, so that lines of a log are not folded."""
 
@@ -273,8 +282,8 @@ def write(text: str) -> None:
 
 def plain(text: str) -> str:
     """The text as one line without anything that a terminal would obey, because some of it came over a network. Signs
-    that the terminal lacks are replaced here, so that columns stay in line."""
-    shown = printable(text, None)
+    that the terminal lacks are replaced here, so that columns stay in line; so are the narrow spaces of figures."""
+    shown = printable(text.replace("\N{NARROW NO-BREAK SPACE}", " "), None)
     return shown if formatting.is_unicode(out.encoding) else formatting.encodable(shown, out.encoding)
 
 
@@ -339,6 +348,41 @@ def attempt(status: str | None) -> Text:
 def styled(state: str) -> Text:
     """A state in its colour."""
     return Text(plain(state), style=STATE_STYLES.get(state, "bold"))
+
+
+def show_section(section: page.Section) -> None:
+    """Prints what can be printed of a section of a page: its title, tables, facts and texts."""
+    show(section.title, "bold")
+    for block in section.blocks:
+        show_block(block)
+
+
+def show_block(block: page.Block) -> None:
+    """Prints a table, facts or texts of a page; blocks of other kinds are for the page alone."""
+    # The library that fills pages is loaded by the few commands that make them.
+    from coec.reports import page
+
+    if isinstance(block, page.Table):
+        show(block.caption)
+        printed = table(*block.heads, right=block.numbers)
+        for row in block.rows:
+            printed.add_row(*(_cell(cell) for cell in row))
+        out.print(printed)
+    elif isinstance(block, page.Facts):
+        printed = table("", "")
+        printed.show_header = False
+        for item in block.items:
+            printed.add_row(*item)
+        out.print(printed)
+    elif isinstance(block, page.Text):
+        for paragraph in block.paragraphs:
+            show(paragraph, "dim" if block.quiet else "")
+
+
+def _cell(cell: str | page.Cell) -> RenderableType:
+    if isinstance(cell, str):
+        return cell
+    return cell.text if cell.tone is None else Text(plain(cell.text), TONE_STYLES[cell.tone])
 
 
 def show_verdict(result: replies.CalibrationResult, mistake: str = "") -> None:

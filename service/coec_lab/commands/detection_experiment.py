@@ -44,13 +44,13 @@ def show(report: DetectionReport, source: str, output: Path | None, *, as_json: 
     """
     from coec.reports import console, page
     from coec.reports.page_parts import Provenance
-    from coec_lab.experiments import evaluation_tables
     from coec_lab.experiments.evaluation_page import detection_page
+    from coec_lab.experiments.evaluation_tables import detection_table
 
     if output is not None:
         page.write(output / "report.html", detection_page(report, source, Provenance.here()))
     console.report(
         {"source": source, **report.model_dump(mode="json")},
-        lambda: evaluation_tables.show_detection(report),
+        lambda: console.show_block(detection_table(report)),
         as_json=as_json,
     )

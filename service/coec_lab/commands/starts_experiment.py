@@ -18,7 +18,7 @@ from coec.reports.page_parts import Provenance
 from coec.schemas.message import to_json
 from coec_lab.commands.evaluate import ALL
 from coec_lab.experiments import evaluation_tables
-from coec_lab.experiments.evaluation_page import comparison_page, evaluation_page
+from coec_lab.experiments.evaluation_page import comparison_page, evaluation_page, show, show_comparison
 from coec_lab.experiments.evaluation_run import Plan, Subject, bench_of, report_of, subject_of, tried
 from coec_lab.experiments.evaluation_schema import ComparisonReport, EvaluationReport
 from coec_lab.experiments.solve_experiments import Stages
@@ -81,9 +81,9 @@ def run(request: EvaluationRequest, folder: Path | None, *, as_json: bool) -> in
     if as_json:
         console.print_json(document)
     elif isinstance(document, ComparisonReport):
-        evaluation_tables.show_comparison(document)
+        show_comparison(document)
     else:
-        evaluation_tables.show(document)
+        show(document)
     # Printed first, so that the figures are not lost if they cannot be written.
     if folder is not None:
         user_files.write_output(folder / "report.json", to_json(document))

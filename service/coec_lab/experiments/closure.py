@@ -26,20 +26,11 @@ from coec.reports import console
 from coec.reports.page_parts import finite_degrees
 from coec.schemas.message import to_json
 from coec.schemas.replies import Vector6
-from coec_lab.experiments import evaluation_tables, solve_experiments, solve_statistics
+from coec_lab.experiments import evaluation_page, solve_experiments, solve_statistics
 from coec_lab.experiments.evaluation_documents import angle_spread_of, normalised_of, spread_of
 from coec_lab.experiments.evaluation_run import Plan, configuration_of
 from coec_lab.experiments.evaluation_schema import ClosureGroup, ClosureReport
 from coec_lab.experiments.solve_experiments import Bench, Stages
-from coec_lab.experiments.solve_statistics import (
-    NormalisedErrors,
-    SolveOutcome,
-    SpreadStatistics,
-    carried,
-    claimed,
-    gathered,
-    normalise,
-)
 
 
 class Relation(StrEnum):
@@ -75,14 +66,16 @@ class Between:
         """(6, 6) how an error of A's calibration carries over to the prediction for B, about the axes of camera B."""
         return se3.adjoint(self.T_b_a) if self.relation is Relation.CAMERAS else np.eye(6)
 
-    def error(self, a: SolveOutcome, b: SolveOutcome) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    def error(
+        self, a: solve_statistics.SolveOutcome, b: solve_statistics.SolveOutcome
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """ξ (6,) from what A predicts to what B found, and its covariance (6, 6) by both claims; None unless both were
         accepted and claim something."""
-        of_a, of_b = claimed(a), claimed(b)
+        of_a, of_b = solve_statistics.claimed(a), solve_statistics.claimed(b)
         if of_a is None or of_b is None:
             return None
         error = se3.difference(b.T_camera_lidar, self.predicted(a.T_camera_lidar))
-        return error, of_b + carried(of_a, self.jacobian)
+        return error, of_b + solve_statistics.carried(of_a, self.jacobian)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,12 +91,12 @@ class Closure:
 
     frames: FrameChoice
     pairs: tuple[int, int]
-    normalised: NormalisedErrors
-    rotation_rad: SpreadStatistics
-    translation_m: SpreadStatistics
+    normalised: solve_statistics.NormalisedErrors
+    rotation_rad: solve_statistics.SpreadStatistics
+    translation_m: solve_statistics.SpreadStatistics
 
 
-Solve = Callable[[int, Sequence[int] | None], SolveOutcome]
+Solve = Callable[[int, Sequence[int] | None], solve_statistics.SolveOutcome]
 """Solves from the start of a trial, on the frames of the given indices (None: all of them)."""
 
 
@@ -141,7 +134,7 @@ def close(
 
     Halves are drawn by index: two sources share instants if they have equal numbers of frames taken together.
     """
-    outcomes_by_frames: dict[FrameChoice, list[tuple[SolveOutcome, SolveOutcome]]] = {
+    outcomes_by_frames: dict[FrameChoice, list[tuple[solve_statistics.SolveOutcome, solve_statistics.SolveOutcome]]] = {
         frames: [] for frames in FrameChoice
     }
     halved = min(pairs) >= 2
@@ -165,7 +158,7 @@ def _closure(
     known: Between,
     frames: FrameChoice,
     pairs: tuple[int, int],
-    outcomes: Sequence[tuple[SolveOutcome, SolveOutcome]],
+    outcomes: Sequence[tuple[solve_statistics.SolveOutcome, solve_statistics.SolveOutcome]],
     dof: int,
 ) -> Closure:
     results = [known.error(a, b) for a, b in outcomes]
@@ -174,7 +167,7 @@ def _closure(
         frames=frames,
         pairs=pairs,
         # All trials see the same recording, so they count as one.
-        normalised=normalise(gathered(results), independent=1),
+        normalised=solve_statistics.normalise(solve_statistics.gathered(results), independent=1),
         rotation_rad=solve_statistics.spread(float(np.linalg.norm(error[:3])) for error in errors),
         translation_m=solve_statistics.spread(float(np.linalg.norm(error[3:])) for error in errors if dof == 6),
     )
@@ -224,7 +217,7 @@ def run(request: ClosureRequest, folder: Path | None, *, as_json: bool) -> int:
         of_frames = {f"closure on {closure.frames.value}": closure.normalised for closure in closures}
         evaluation_pictures.write_normalised(folder, name, of_frames)
         user_files.write_output(folder / "report.json", to_json(document))
-    console.report(document, lambda: evaluation_tables.show_closure(document), as_json=as_json)
+    console.report(document, lambda: evaluation_page.show_closure(document), as_json=as_json)
     return 0
 
 

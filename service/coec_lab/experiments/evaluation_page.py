@@ -1,14 +1,16 @@
-"""The page of `coec evaluate`: solves from starts all around a known pose, how many found it, and how far off they
-ended."""
+"""The page of `coec evaluate`, and what it prints: solves from starts all around a known pose, how many found it, and
+how far off they ended. Page and console show the same sections; only pictures are for the page alone."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
+from coec.reports import console
 from coec.reports.charts import Chart, Limit, Series
-from coec.reports.console import AXIS_NAMES, UNITS
 from coec.reports.formatting import count, number, percent
-from coec.reports.page import Block, Cell, Charts, Facts, Page, Section, Table, Text, Tone, VerdictBanner
-from coec.reports.page_parts import DIGITS, SHOWN_UNITS, Provenance, depth_items
+from coec.reports.page import Block, Cell, Charts, Page, Section, Table, Text, Tone, VerdictBanner
+from coec.reports.page_parts import Provenance, depth_items
 from coec_lab.experiments import evaluation_charts, evaluation_schema
+from coec_lab.experiments import evaluation_tables as tables
 from coec_lab.experiments.evaluation_tables import reference_doubt, setting
 
 ERROR_MEANING = (
@@ -26,39 +28,40 @@ def evaluation_page(
         ends: pictures of where searches ended.
         worst: pictures of the start that ended farthest from the reference.
     """
-    sections = [
-        Section("Errors", (_spreads(report), _axes(report), Text((ERROR_MEANING,), quiet=True))),
-        Section("Did it know?", (_verdicts(report),)),
+    sections = (*_sections(report, ends, worst), made.section(_origin(report)))
+    title = f"Evaluation of {report.objective} on {report.vehicle} / {report.pair}"
+    return Page("coec evaluate", title, (_verdict(report),), sections)
+
+
+def show(report: evaluation_schema.EvaluationReport) -> None:
+    """Prints the figures of one method."""
+    console.show(f"{report.window_id}: {_verdict(report).sentence}", "bold")
+    doubt = reference_doubt(report)
+    if doubt is not None:
+        console.show(doubt, "yellow")
+    for section in _sections(report):
+        console.show_section(section)
+
+
+def _sections(
+    report: evaluation_schema.EvaluationReport, ends: Sequence[Block] = (), worst: Sequence[Block] = ()
+) -> list[Section]:
+    errors = tables.spreads_table(report), tables.axes_table(report)
+    return [
+        Section("Errors", (*errors, Text((ERROR_MEANING,), quiet=True))),
+        Section("Did it know?", (tables.verdicts_table(report),)),
         *((Section("Where the searches ended", tuple(ends)),) if ends else ()),
         *((Section(f"The worst start, number {report.worst_start}", tuple(worst)),) if worst else ()),
         *_experiments(report),
-        Section("How it was evaluated", (_setting(report),)),
-        made.section(_origin(report)),
+        Section("How it was evaluated", (tables.setting_facts(report),)),
     ]
-    title = f"Evaluation of {report.objective} on {report.vehicle} / {report.pair}"
-    return Page("coec evaluate", title, (_verdict(report),), tuple(sections))
 
 
 def comparison_page(report: evaluation_schema.ComparisonReport, ends: Sequence[Block], made: Provenance) -> Page:
     """The page of several methods side by side, with pictures of where their searches ended. Each method also has a
     page of its own in the folder of its name."""
-    rows: list[Sequence[str | Cell]] = [
-        (
-            Cell(name, href=f"{name}/report.html"),
-            percent(of.hit_rate),
-            number(of.rotation_deg.median),
-            number(of.rotation_deg.p95),
-            number(of.rotation_deg.max),
-            *(number(value, DIGITS["m"]) for value in (of.translation_m.median, of.translation_m.max)),
-            str(of.verdicts.accepted_misses),
-            percent(of.classified_correctly),
-            number(of.solve_s.median, 2),
-        )
-        for name, of in report.methods.items()
-    ]
-    errors = ("Rotation, median °", "p95 °", "Max °", "Translation, median m", "Max m")
-    heads = ("Method", "Hits", *errors, "Accepted misses", "Classified correctly", "One solve, s")
-    table = Table("Errors are of all starts, hits and misses", heads, rows, frozenset(range(1, len(heads))))
+    table = tables.comparison_table(report)
+    links: tuple[str | Cell, ...] = ("Page", *(Cell("open", href=f"{name}/report.html") for name in report.methods), "")
     best = max(report.methods.values(), key=lambda of: of.hit_rate)
     sentence = f"Of {best.starts} starts {setting(best.start_rotation_deg, best.start_translation_m)} " + ", ".join(
         f"{name} brings home {of.hits}" for name, of in report.methods.items()
@@ -66,7 +69,7 @@ def comparison_page(report: evaluation_schema.ComparisonReport, ends: Sequence[B
     missing = list(report.not_evaluated.items())
     not_allowed = Table("This source does not allow them", ("Method", "Why"), missing, prose=frozenset({1}))
     sections = (
-        Section("Side by side", (table,)),
+        Section("Side by side", (replace(table, rows=(*table.rows, links)),)),
         *((Section("Where the searches ended", tuple(ends)),) if ends else ()),
         *((Section("Not evaluated", (not_allowed,)),) if missing else ()),
         made.section((("Source", report.source),)),
@@ -75,26 +78,46 @@ def comparison_page(report: evaluation_schema.ComparisonReport, ends: Sequence[B
     return Page("coec evaluate", f"Methods side by side on {best.vehicle} / {best.pair}", opening, sections)
 
 
-def detection_table(detection: evaluation_schema.DetectionReport) -> Table:
-    """Checks after moves of the extrinsic, and how many of them each classifier flags."""
-    rows = [
-        (
-            row.name,
-            str(row.checks),
-            percent(row.flagged),
-            f"{percent(row.flagged_low)} to {percent(row.flagged_high)}",
-            percent(row.undecided),
-            percent(row.flagged_by_paper),
-        )
-        for row in detection.moves
-    ]
-    heads = ("Extrinsic", "Checks", "Flagged", "95 % interval", "Undecided", "By equation (2)")
-    caption = (
-        f"{count(detection.splits, 'split')} of {detection.pairs} pairs: limits learned on one half, tried on the "
-        "other. What is flagged of the right extrinsic are false alarms; equation (2) is shown for comparison and "
-        "decides nothing."
+def show_comparison(report: evaluation_schema.ComparisonReport) -> None:
+    """Prints the methods side by side, and why some are missing."""
+    first = next(iter(report.methods.values()))
+    console.show(
+        f"{first.window_id}: {count(first.pairs, 'pair')}, {first.camera_model} camera, {first.dof} degrees of freedom"
     )
-    return Table(caption, heads, rows, frozenset(range(1, 6)))
+    console.show(f"{first.starts} starts {setting(first.start_rotation_deg, first.start_translation_m)}")
+    console.show_block(tables.comparison_table(report))
+    for name, reason in report.not_evaluated.items():
+        console.show(f"{name} was not evaluated: {reason}", "yellow")
+    for name, method in report.methods.items():
+        for section in _experiments(method):
+            console.show_section(replace(section, title=f"{name}: {section.title}"))
+    console.show(_seconds(report.elapsed_s))
+
+
+def show_closure(report: evaluation_schema.ClosureReport) -> None:
+    """Prints how two calibrations close."""
+    console.show(f"A {report.source_a}")
+    console.show(f"B {report.source_b}")
+    known = ", ".join(f"{number(value)} {unit}" for value, unit in zip(report.known, console.UNITS, strict=True))
+    origin = "as the recordings tell" if report.from_recordings else "as given"
+    console.show(f"{report.relation}; A in the frame of B, {origin}: {known}")
+    console.show(
+        f"{report.trials} starts {setting(report.start_rotation_deg, report.start_translation_m)}, objective "
+        f"{report.objective}, {report.dof} degrees of freedom"
+    )
+    for group in report.groups:
+        pairs = f"{group.pairs_a}" if group.pairs_a == group.pairs_b else f"{group.pairs_a} and {group.pairs_b}"
+        spreads = [("Rotation", group.rotation_deg, "°", 3)]
+        if report.dof == 6:
+            spreads.append(("Translation", group.translation_m, "m", 4))
+        errors = tables.spread_table("Closure error", spreads)
+        console.show_section(Section(f"{group.frames}: {pairs} pairs", (errors,)))
+        console.show_section(_normalised(group.errors))
+    console.show(_seconds(report.elapsed_s))
+
+
+def _seconds(elapsed_s: dict[str, float]) -> str:
+    return "  ".join(f"{stage} {seconds:.1f} s" for stage, seconds in elapsed_s.items())
 
 
 def _verdict(report: evaluation_schema.EvaluationReport) -> VerdictBanner:
@@ -120,61 +143,24 @@ def _verdict(report: evaluation_schema.EvaluationReport) -> VerdictBanner:
     return VerdictBanner(tone, "No miss was accepted.", f"{sentence}{lost}")
 
 
-def _spreads(report: evaluation_schema.EvaluationReport) -> Table:
-    def row(name: str, spread: evaluation_schema.Spread, unit: str, digits: int) -> tuple[str, ...]:
-        return name, *(number(value, digits) for value in (spread.median, spread.p95, spread.max)), unit
-
-    rows = [row("Rotation error", report.rotation_deg, "°", 3)]
-    if report.dof == 6 or report.start_translation_m > 0:
-        rows.append(row("Translation error", report.translation_m, "m", 4))
-    rows += [row("One solve", report.solve_s, "s", 2), row("Evaluations", report.evaluations, "", 0)]
-    return Table("All starts, hits and misses", ("", "Median", "95 %", "Largest", "Unit"), rows, frozenset({1, 2, 3}))
-
-
-def _axes(report: evaluation_schema.EvaluationReport) -> Table:
-    columns = (report.bias, report.std, report.rms, report.sigma, report.median, report.from_reference)
-    rows = [
-        (
-            AXIS_NAMES[axis],
-            *(number(of[axis], DIGITS[UNITS[axis]], sign=at in (0, 4, 5)) for at, of in enumerate(columns)),
-            SHOWN_UNITS[UNITS[axis]],
-        )
-        for axis in range(report.dof)
-    ]
-    named = ("Bias of hits", "Std of hits", "Rms of hits", "σ claimed", "Median of all", "From the reference")
-    return Table("Error per axis of the camera", ("Axis", *named, "Unit"), rows, frozenset(range(1, 7)))
-
-
-def _verdicts(report: evaluation_schema.EvaluationReport) -> Table:
-    counts = report.verdicts
-    rows = (
-        (Cell("accepted", tone="good"), str(counts.accepted_hits), str(counts.accepted_misses)),
-        (Cell("refused", tone="bad"), str(counts.failed_hits), str(counts.failed_misses)),
-    )
-    return Table("Starts by verdict and by truth", ("Verdict", "Hits", "Misses"), rows, frozenset({1, 2}))
-
-
 def _experiments(report: evaluation_schema.EvaluationReport) -> list[Section]:
     sections = []
     hit_deg = report.hit_rotation_deg
     if report.frames:
         at = [float(point.frames) for point in report.frames]
         chart = _errors_chart("Error against the number of frames", "frames in the window", at, report.frames, hit_deg)
-        sections.append(Section("How many frames it takes", (Charts((chart,)), _points(report.frames, at, "Frames"))))
+        sections.append(Section("How many frames it takes", (Charts((chart,)), tables.frames_table(report.frames))))
     if report.slices:
         at = [point.length_s for point in report.slices]
         chart = _errors_chart("Error against the length of the slice", "slice, s", at, report.slices, hit_deg)
-        sections.append(
-            Section("How long a slice it takes", (Charts((chart,)), _points(report.slices, at, "Slice, s")))
-        )
+        sections.append(Section("How long a slice it takes", (Charts((chart,)), tables.slices_table(report.slices))))
     if report.halves is not None:
-        sections.append(Section("Disjoint halves of the frames", (_halves(report.halves, report.dof),)))
-    for of_claims in report.normalised:
-        sections.append(Section(f"Errors against {of_claims.against}", _normalised(of_claims)))
+        sections.append(Section("Disjoint halves of the frames", (tables.halves_table(report.halves, report.dof),)))
+    sections += [_normalised(of_claims) for of_claims in report.normalised]
     if report.detection is not None:
-        sections.append(Section("How well a wrong extrinsic is seen", (detection_table(report.detection),)))
+        sections.append(Section("How well a wrong extrinsic is seen", (tables.detection_table(report.detection),)))
     if report.steps:
-        sections.append(Section("Windows with a knock in them", (_steps(report.steps),)))
+        sections.append(Section("Windows with a knock in them", (tables.steps_table(report.steps),)))
     return sections
 
 
@@ -211,97 +197,16 @@ MOST_TICKS = 8
 """Most points of an axis for which each gets a label; with more, labels would run into each other."""
 
 
-def _points(
-    points: Sequence[evaluation_schema.FramesPoint | evaluation_schema.SlicePoint], at: Sequence[float], head: str
-) -> Table:
-    rows = [
-        (
-            f"{x:g}",
-            percent(point.hit_rate, 0),
-            *(number(value) for value in (point.rotation_deg.median, point.rotation_deg.p95, point.rotation_deg.max)),
-            number(point.sigma_deg),
+def _normalised(report: evaluation_schema.NormalisedErrorsReport) -> Section:
+    blocks: tuple[Block, ...] = (tables.normalised_table(report),)
+    if report.nees is not None:
+        nees = (
+            f"NEES per axis {number(report.nees, 2)}; of true claims {number(report.nees_low, 2)} to "
+            f"{number(report.nees_high, 2)} in 95 % of evaluations with {report.independent} results that share no "
+            "frame."
         )
-        for x, point in zip(at, points, strict=True)
-    ]
-    heads = (head, "Hits", "Median, °", "95 %, °", "Largest, °", "σ claimed, °")
-    return Table("Rotation errors of all solves", heads, rows, frozenset(range(6)))
-
-
-def _halves(halves: evaluation_schema.HalvesReport, dof: int) -> Table:
-    rows = [
-        (
-            AXIS_NAMES[axis],
-            *(number(of[axis], DIGITS[UNITS[axis]]) for of in (halves.rms, halves.largest, halves.sigma)),
-            percent(halves.covered[axis]),
-            SHOWN_UNITS[UNITS[axis]],
-        )
-        for axis in range(dof)
-    ]
-    caption = (
-        f"{count(halves.splits, 'split')} into halves of {halves.pairs} frames: {halves.solved} solved, "
-        f"{halves.accepted} accepted on both sides, {halves.hits} hit on both. No frame is in both halves."
-    )
-    heads = ("Difference", "Rms", "Largest", "σ claimed", "Within 3 σ", "Unit")
-    return Table(caption, heads, rows, frozenset(range(1, 5)))
-
-
-def _normalised(report: evaluation_schema.NormalisedErrorsReport) -> tuple[Block, ...]:
-    rows = [
-        (
-            name,
-            *(number(of[axis], 4) for of in (report.rms, report.largest, report.sigma)),
-            number(report.sigma_over_rms[axis], 2),
-            *(percent(of[axis]) for of in (report.within_1_sigma, report.within_2_sigma, report.within_3_sigma)),
-            SHOWN_UNITS[UNITS[axis]],
-        )
-        for axis, name in enumerate(AXIS_NAMES)
-        if report.sigma[axis] is not None
-    ]
-    heads = ("Error", "Rms", "Largest", "σ claimed", "σ / rms", "Within 1 σ", "2 σ", "3 σ", "Unit")
-    caption = f"{report.judged} accepted, {report.refused} refused. True claims hold 68.3, 95.4 and 99.7 %."
-    table = Table(caption, heads, rows, frozenset(range(1, 8)))
-    if report.nees is None:
-        return (table, evaluation_charts.normalised(report))
-    nees_text = (
-        f"NEES per axis {number(report.nees, 2)}; of true claims {number(report.nees_low, 2)} to "
-        f"{number(report.nees_high, 2)} in 95 % of evaluations with {report.independent} results that share no frame."
-    )
-    return table, Text((nees_text,), quiet=True), evaluation_charts.normalised(report)
-
-
-def _steps(steps: Sequence[evaluation_schema.StepRow]) -> Table:
-    rows = [
-        (
-            row.name,
-            str(row.windows),
-            *(percent(share, 0) for share in (row.moved, row.accepted, row.wrong, row.time_known)),
-            *(f"{number(seconds, 1)}" for seconds in (row.off_s, row.told_s)),
-            percent(row.holds, 0),
-        )
-        for row in steps
-    ]
-    shares = ("Refused for it", "Accepted", "Accepted and wrong", "Time known to 2 s")
-    heads = ("Mount moves by", "Windows", *shares, "Off by, s", "Told within, s", "And is")
-    return Table("Windows within which the mount was moved", heads, rows, frozenset(range(1, 9)))
-
-
-def _setting(report: evaluation_schema.EvaluationReport) -> Facts:
-    box = f"±{report.search_rotation_deg:g}°"
-    if report.search_translation_m > 0:
-        box += f", ±{report.search_translation_m:g} m"
-    stop_reasons = ", ".join(f"{reason.replace('_', ' ')} {starts}" for reason, starts in report.stop_reasons.items())
-    return Facts(
-        (
-            ("Objective", report.objective),
-            ("Degrees of freedom", str(report.dof)),
-            ("Camera model", report.camera_model),
-            ("Pairs of image and sweep", str(report.pairs)),
-            ("Starts", f"{report.starts}, {setting(report.start_rotation_deg, report.start_translation_m)}"),
-            ("Search box", box),
-            ("Searches ended as", stop_reasons),
-            *((f"Time, {stage}", f"{number(seconds, 1)} s") for stage, seconds in report.elapsed_s.items()),
-        )
-    )
+        blocks = (*blocks, Text((nees,), quiet=True))
+    return Section(f"Errors against {report.against}", (*blocks, evaluation_charts.normalised(report)))
 
 
 def _origin(report: evaluation_schema.EvaluationReport) -> tuple[tuple[str, str], ...]:
@@ -318,7 +223,7 @@ def detection_page(detection: evaluation_schema.DetectionReport, source: str, ma
     checks = sum(row.checks for row in detection.moves)
     sentence = f"{count(checks, 'check')} at the right extrinsic and at moved ones; see which of them are flagged."
     sections = (
-        Section("Checks by move", (detection_table(detection),)),
+        Section("Checks by move", (tables.detection_table(detection),)),
         made.section((("Source", source),)),
     )
     return Page(
