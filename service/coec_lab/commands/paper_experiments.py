@@ -22,7 +22,6 @@ from coec.reports import console, page
 from coec.reports.page import Block
 from coec.reports.page_parts import Provenance
 from coec_lab.experiments import evaluation_charts, paper_figures, plots, solve_experiments, solve_statistics
-from coec_lab.experiments.evaluation_charts import bullseye
 from coec_lab.experiments.paper_figures import Plots, paper_page, run_times
 from coec_lab.experiments.solve_experiments import Bench, Stages, greys_of, inferred
 from coec_lab.experiments.solve_statistics import SolveOutcome
@@ -81,7 +80,7 @@ def run(request: PaperRequest, folder: Path, *, as_json: bool) -> int:
         failure, metrics = _failure_metrics(bench, request, folder, stages)
         far, ends = _bullseye(bench, request, folder, stages)
         along, drive = _drive(bench, request, folder, stages)
-        document = {
+        document: dict[str, Any] = {
             "source": request.source,
             "objective": request.objective,
             "pairs": len(window.pairs),
@@ -96,7 +95,9 @@ def run(request: PaperRequest, folder: Path, *, as_json: bool) -> int:
     if as_json:
         console.print_json(document)
     else:
-        _show(document)
+        console.show_block(paper_figures.moves_table(failure["moves"]))
+        console.show_block(paper_figures.solves_table(document))
+        console.show_block(paper_figures.times_table(document["run_times"]))
         console.show(f"written to {written.parent}")
     return 0
 
@@ -127,8 +128,9 @@ def _failure_metrics(bench: Bench, request: PaperRequest, folder: Path, stages: 
     title = (
         f"{bench.window.window_id}: equation (2), limits learned on the other half of the pairs; flagged at {shares}"
     )
-    user_files.write_output(folder / "metrics.png", plots.failure_metrics(tried, limits, title))
-    return {"limits": asdict(limits), "moves": rows}, evaluation_charts.failure_figures(tried, limits)
+    figures = evaluation_charts.failure_figures(tried, limits)
+    user_files.write_output(folder / "metrics.png", plots.charts(figures, title, 3, (4.7, 4.6)))
+    return {"limits": asdict(limits), "moves": rows}, figures
 
 
 def _bullseye(bench: Bench, request: PaperRequest, folder: Path, stages: Stages) -> tuple[dict[str, Any], Block]:
@@ -145,7 +147,7 @@ def _bullseye(bench: Bench, request: PaperRequest, folder: Path, stages: Stages)
     )
     spheres = {"Rotation vectors of the starts": solve_experiments.sphere_directions(request.runs)}
     user_files.write_output(folder / "bullseye.png", plots.bullseye(outcomes, spheres, title))
-    return {"start_deg": FAR_DEG, **_figures(outcomes)}, bullseye({"": outcomes}, spheres)
+    return {"start_deg": FAR_DEG, **_figures(outcomes)}, evaluation_charts.bullseye({"": outcomes}, spheres)
 
 
 def _drive(bench: Bench, request: PaperRequest, folder: Path, stages: Stages) -> tuple[list[dict[str, Any]], Block]:
@@ -184,8 +186,9 @@ def _drive(bench: Bench, request: PaperRequest, folder: Path, stages: Stages) ->
     windows = f"{count} window{'' if count == 1 else 's'}"
     title = f"{bench.window.window_id}: {request.objective}, {windows}"
     named = {f"from {radius_deg:g}°": outcomes for radius_deg, outcomes in solved.items()}
-    user_files.write_output(folder / "drive.png", plots.drive(named, title))
-    return rows, evaluation_charts.drive(named)
+    errors = evaluation_charts.drive(named)
+    user_files.write_output(folder / "drive.png", plots.charts(errors, title, 1, (11.0, 2.9)))
+    return rows, errors
 
 
 def _window_count(bench: Bench, request: PaperRequest) -> int:
@@ -248,34 +251,3 @@ def _figures(outcomes: Sequence[SolveOutcome]) -> dict[str, Any]:
         "mean_deg": errors.mean(axis=0).tolist(),
         "std_deg": errors.std(axis=0).tolist(),
     }
-
-
-def _show(document: dict[str, Any]) -> None:
-    moves = console.table("extrinsic off by", "checks", "flagged by equation (2)", "published", right=(1, 2, 3))
-    for row in document["failure_metrics"]["moves"]:
-        published = paper_figures.FLAGGED.get(row["moved_deg"])
-        theirs = "" if published is None else f"{100 * published:.1f} %"
-        moves.add_row(f"{row['moved_deg']:g}°", str(row["checks"]), f"{100 * row['flagged']:.1f} %", theirs)
-    console.out.print(moves)
-    solves = console.table("solves", "runs", "hits", "classified", "pitch", "yaw", "roll", right=(1, 2, 3, 4, 5, 6))
-    for name, row in [("all pairs", document["bullseye"]), *(("windows", row) for row in document["drive"])]:
-        correct = f"{100 * row['classified_correctly']:.0f} %"
-        spread = [_spread(*axis) for axis in zip(row["mean_deg"], row["std_deg"], strict=True)]
-        solves.add_row(f"{name}, from {row['start_deg']:g}°", str(row["runs"]), str(row["hits"]), correct, *spread)
-        axes = paper_figures.ERRORS_DEG.get(row["start_deg"])
-        if axes is not None:
-            solves.add_row("  published", "1400", "", "", *(_spread(*axis) for axis in axes))
-        else:
-            solves.add_row("  published", str(paper_figures.FAR_RUNS), str(paper_figures.FAR_HITS), "100 %")
-    console.out.print(solves)
-    speed = console.table("frames", "one MI, ms", "published", "one solve, ms", "published", right=range(5))
-    for row in document["run_times"]:
-        mi_ms, solve_ms = paper_figures.RUN_TIMES_MS.get(row["frames"], (None, None))
-        theirs_mi, theirs_solve = console.figure(mi_ms, 1), console.figure(solve_ms, 0)
-        ours_mi, ours_solve = console.figure(row["mi_ms"], 2), console.figure(row["solve_ms"], 0)
-        speed.add_row(str(row["frames"]), ours_mi, theirs_mi, ours_solve, theirs_solve)
-    console.out.print(speed)
-
-
-def _spread(mean_deg: float, std_deg: float) -> str:
-    return f"{mean_deg:+.3f} ± {std_deg:.3f}°"

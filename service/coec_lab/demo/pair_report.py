@@ -30,8 +30,8 @@ from coec.reports.page_parts import TONES, Provenance, copies_of, figures_block,
 from coec.schemas import replies
 from coec.schemas.message import to_json
 from coec_lab.demo import pair_client
-from coec_lab.demo.demo_plots import timeline
 from coec_lab.demo.pair_client import ALARM, Moment, Observer, PairOutcome, Snapshot, is_repaired
+from coec_lab.experiments.plots import charts
 
 if TYPE_CHECKING:
     from coec_lab.simulation.drive import SimulatedDrive
@@ -104,11 +104,8 @@ def write(
         OutputError: a file cannot be written.
     """
     written = [first] if window is None else [first, window]
-    plot = write_file(
-        output / "timeline.png",
-        timeline(observer.series, _marks(outcome), pair_client.MAX_ERROR_DEG, pair_client.TITLE),
-    )
-    written.append(plot)
+    curve = Charts((error_curve(observer.series, outcome),))
+    written.append(write_file(output / "timeline.png", charts(curve, pair_client.TITLE, 1, (11.0, 4.6))))
     result, compared = None, None
     if window is not None:
         result = read_result(window)
@@ -127,17 +124,9 @@ def write(
 
 def show(moments: Sequence[Moment], outcome: PairOutcome, left: WrittenFiles) -> None:
     """Prints the summary in the terminal."""
-    steps = console.table("elapsed", "drive", "health", "extrinsic", "error", "", right=(0, 1, 4))
-    for moment, what in zip(moments, _happenings(moments, outcome), strict=True):
-        times = (f"{moment.t_s:.0f} s", f"{moment.drive_s:.1f} s")
-        served = f"{moment.provenance}, {console.attempt(moment.status)}"
-        steps.add_row(*times, console.styled(moment.health), served, f"{moment.error_deg:.3f}°", what)
-    console.out.print(steps)
+    console.show_block(_timeline_table(list(zip(moments, _happenings(moments, outcome), strict=True))))
     console.out.print()
-    summary = console.table("", "", right=(1,))
-    for name, value in _summary(outcome, moments):
-        summary.add_row(name, value)
-    console.out.print(summary)
+    console.show_block(Facts(tuple(_summary(outcome, moments))))
     console.out.print()
     for path in left.files:
         console.show(f"{path}  {path.stat().st_size} bytes")
@@ -184,11 +173,6 @@ def _close_up(window: Window, xyz_m: NDArray[np.floating], T_camera_lidar: Matri
     image = np.ascontiguousarray(decode_bgr(pair.camera.image, LimitsConfig())[part])
     mask = None if rig.mask is None else np.ascontiguousarray(rig.mask[part])
     return draw_overlay(image, camera, T_camera_lidar, xyz_m, mask)
-
-
-def _marks(outcome: PairOutcome) -> list[tuple[float, str]]:
-    named = ((outcome.knock_s, "displacement"), (outcome.alarm_s, "alarm"), (outcome.repaired_s, "correction"))
-    return [(second, what) for second, what in named if second is not None]
 
 
 def _happenings(moments: Sequence[Moment], outcome: PairOutcome) -> list[str]:
@@ -253,7 +237,7 @@ def demo_page(
         compared: points on the image before and after the correction; None: they were not rendered.
         window: the recorded window that corrected the mount; None: there is none.
     """
-    sections = [Section("Error and health over the drive", (Charts((_curve(series, outcome),)),))]
+    sections = [Section("Error and health over the drive", (Charts((error_curve(series, outcome),)),))]
     if compared is not None:
         sections.append(Section("Points on the image", (compared,)))
     sections.append(Section("What the service reported", (_timeline_table(happened),)))
@@ -268,7 +252,8 @@ def demo_page(
     return Page("coec demo", title, opening, (*sections, made.section()))
 
 
-def _curve(series: Sequence[Sample], outcome: PairOutcome) -> Chart:
+def error_curve(series: Sequence[Sample], outcome: PairOutcome) -> Chart:
+    """The error of what is served, over the states of health and between the displacement, alarm and correction."""
     ends = [second for second, *_ in series[1:]] + [series[-1][0]]
     spans_of = [(second, end, state) for (second, _, state), end in zip(series, ends, strict=True)]
     grounds = []

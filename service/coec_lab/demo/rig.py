@@ -492,11 +492,7 @@ def summary(outcome: ActOutcome, scenario: Scenario) -> str:
 def show(acts: Sequence[Performance], files: Sequence[Path], scenario: Scenario) -> None:
     """Prints the summary in the terminal."""
     for outcome, snapshots in acts:
-        order = _order(outcome.act, snapshots[0])
-        rows = console.table("drive", *order, "checked", right=(0,))
-        for snapshot in changes(snapshots):
-            rows.add_row(f"{snapshot.second:.1f} s", *_cells(snapshot, order), snapshot.checked)
-        console.out.print(rows)
+        console.show_block(_changes_table(outcome.act, snapshots))
         console.show(summary(outcome, scenario), "bold green" if outcome.passed else "bold red")
         console.out.print()
     for path in files:
@@ -583,25 +579,16 @@ def _order(act: Act, snapshot: RigSnapshot) -> tuple[str, ...]:
 def _changes_table(act: Act, snapshots: Sequence[RigSnapshot]) -> Table:
     order = _order(act, snapshots[0])
     rows: list[Sequence[str | Cell]] = [
-        (f"{snapshot.second:.1f} s", *_toned(snapshot, order), snapshot.checked) for snapshot in changes(snapshots)
+        (f"{snapshot.second:.1f} s", *(_state_cell(snapshot.sensors[name]) for name in order), snapshot.checked)
+        for snapshot in changes(snapshots)
     ]
     heads = ("Drive", *order, "Checked")
     return Table("State of every sensor, whenever it changed", heads, rows, frozenset({0}))
 
 
-def _toned(snapshot: RigSnapshot, order: Sequence[str]) -> list[Cell]:
-    states = [snapshot.sensors[name].state for name in order]
-    return [
-        Cell(text, tone=TONES.get(state, "none")) for text, state in zip(_cells(snapshot, order), states, strict=True)
-    ]
-
-
-def _cells(snapshot: RigSnapshot, order: Sequence[str]) -> list[str]:
-    seen = [snapshot.sensors[name] for name in order]
-    return [
-        state_text(sensor.state) + ("" if sensor.probability < 0.005 else f", {percent(sensor.probability)}")
-        for sensor in seen
-    ]
+def _state_cell(sensor: SensorCondition) -> Cell:
+    share = "" if sensor.probability < 0.005 else f", {percent(sensor.probability)}"
+    return Cell(state_text(sensor.state) + share, tone=TONES.get(sensor.state, "none"))
 
 
 def _states(snapshot: RigSnapshot) -> list[str]:

@@ -210,10 +210,10 @@ def paper_page(document: Mapping[str, Any], plots: Plots, made: Provenance) -> P
     sections = (
         Section(
             "Wrong extrinsics flagged by equation (2)",
-            (_moves(document["failure_metrics"]["moves"]), plots.metrics),
+            (moves_table(document["failure_metrics"]["moves"]), plots.metrics),
         ),
-        Section("Solves", (_solves(document), plots.bullseye, plots.drive)),
-        Section("Run times", (_times(document["run_times"]),)),
+        Section("Solves", (solves_table(document), plots.bullseye, plots.drive)),
+        Section("Run times", (times_table(document["run_times"]),)),
         made.section(
             (("Source", document["source"]), ("Objective", document["objective"]), ("Pairs", str(document["pairs"])))
         ),
@@ -222,7 +222,8 @@ def paper_page(document: Mapping[str, Any], plots: Plots, made: Provenance) -> P
     return Page("coec paper", "The published experiments, repeated", opening, sections)
 
 
-def _moves(moves: Sequence[Mapping[str, Any]]) -> Table:
+def moves_table(moves: Sequence[Mapping[str, Any]]) -> Table:
+    """Extrinsics that equation (2) flags, beside the published share."""
     rows = [
         (
             f"{row['moved_deg']:g}°",
@@ -237,7 +238,8 @@ def _moves(moves: Sequence[Mapping[str, Any]]) -> Table:
     return Table(caption, heads, rows, frozenset(range(4)))
 
 
-def _solves(document: Mapping[str, Any]) -> Table:
+def solves_table(document: Mapping[str, Any]) -> Table:
+    """Errors of the solves, each row above the published one."""
     rows: list[tuple[str, ...]] = []
     for name, row in (("All pairs", document["bullseye"]), *(("Windows", row) for row in document["drive"])):
         ours = [_spread(*axis) for axis in zip(row["mean_deg"], row["std_deg"], strict=True)]
@@ -253,7 +255,8 @@ def _solves(document: Mapping[str, Any]) -> Table:
     return Table("Mean and standard deviation of the error of all runs", heads, rows, frozenset(range(1, 7)))
 
 
-def _times(times: Sequence[Mapping[str, Any]]) -> Table:
+def times_table(times: Sequence[Mapping[str, Any]]) -> Table:
+    """Run times beside the published ones."""
     rows = []
     for row in times:
         mi_ms, solve_ms = RUN_TIMES_MS.get(row["frames"], (None, None))

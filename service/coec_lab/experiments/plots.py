@@ -1,5 +1,5 @@
 """Plots of experiments as PNG bytes, by matplotlib: where solves started and ended, objectives along the axes, errors
-against the amount of data, normalised errors, the paper's figures, the quality of a depth network. Drawn in memory:
+against the amount of data, normalised errors, the charts of a page, the quality of a depth network. Drawn in memory:
 no display, no window, no global state of matplotlib.
 
 Colours of errors run from dark (good) to bright (bad) on a logarithmic scale about the limit of a hit.
@@ -19,14 +19,14 @@ from matplotlib.lines import Line2D
 from matplotlib.projections.polar import PolarAxes
 from numpy.typing import NDArray
 
-from coec.calibration.baseline import PaperLimits
+from coec.reports.charts import Chart
 from coec.reports.console import AXIS_NAMES
+from coec.reports.page import Charts
 from coec_lab.experiments import evaluation_charts, solve_statistics
 from coec_lab.experiments.depth_quality import DepthQuality, Pairing
 from coec_lab.experiments.evaluation_schema import FramesPoint, SlicePoint, Spread
 from coec_lab.experiments.matrix_statistics import normalised_errors
 from coec_lab.experiments.objective_scans import Scan, Views
-from coec_lab.experiments.paper_figures import MOVES_DEG, FailureFigures
 from coec_lab.experiments.simulation_schemas import MatrixReport, SolveStatistics
 
 DPI = 110
@@ -458,54 +458,43 @@ def frame(image_bgr: NDArray[np.uint8], values: NDArray[np.float32], pairing: Pa
     return png(figure)
 
 
-MOVE_COLOURS = ("tab:green", "tab:orange", "tab:red")
+TONE_COLOURS = {"good": "tab:green", "unsure": "gold", "poor": "orange", "bad": "tab:red", "none": "silver"}
+"""Colours of the states behind a curve."""
 
-PANELS = (
-    ("mi", "mutual information, nats"),
-    ("f1", "largest slope f', nats per rad"),
-    ("f2", "least peakedness f'', nats per rad²"),
-)
-
-FAILURE_BINS = 30
-
-ROTATIONS = ((2, "roll"), (0, "pitch"), (1, "yaw"))
-"""Axis and name, in the order of the paper."""
+SHAPES = {"line": "-", "steps": "-", "points": "o", "dotted": ":"}
+"""Format of matplotlib for each shape of a series."""
 
 
-def failure_metrics(figures: Sequence[FailureFigures], limits: PaperLimits, title: str) -> bytes:
-    """The three figures at the right pose and at wrong ones, with the limits between them."""
-    figure = titled(title, 14.0, 4.6)
-    for axes, (name, label) in zip(figure.subplots(1, 3), PANELS, strict=True):
-        values = {moved: [getattr(f, name) for f in figures if f.moved_deg == moved] for moved in MOVES_DEG}
-        edges = np.histogram_bin_edges(np.concatenate(list(values.values())), FAILURE_BINS)
-        for colour, (moved, of) in zip(MOVE_COLOURS, values.items(), strict=True):
-            what = "right" if moved == 0.0 else f"{moved:g}° off"
-            axes.hist(of, edges, color=colour, alpha=0.55, label=what)
-        limit = {"mi": limits.min_mi, "f1": limits.max_f1, "f2": limits.min_f2}[name]
-        axes.axvline(limit, color="black", linestyle="--", label=f"limit {limit:.3g}")
-        axes.set_xlabel(label)
-        _grid_and_legend(axes)
+def charts(block: Charts, title: str, columns: int, panel_inches: tuple[float, float]) -> bytes:
+    """The charts of a page as one picture, in rows of `columns` panels of one size (width, height)."""
+    rows = -(-len(block.items) // columns)
+    width, height = panel_inches
+    figure = titled(title, width * columns, height * rows)
+    for axes, chart in zip(figure.subplots(rows, columns, squeeze=False).flat, block.items, strict=False):
+        _plot_chart(axes, chart)
     return png(figure)
 
 
-def drive(runs: Mapping[str, Sequence[tuple[float, solve_statistics.SolveOutcome]]], title: str) -> bytes:
-    """Errors of roll, pitch and yaw over sensor time (seconds), for several named sets of starts."""
-    figure = titled(title, 11.0, 8.0)
-    panels = figure.subplots(3, 1, sharex=True)
-    for axes, (axis, name) in zip(panels, ROTATIONS, strict=True):
-        for label, outcomes in runs.items():
-            seconds = [second for second, _ in outcomes]
-            errors = np.degrees([outcome.error[axis] for _, outcome in outcomes])
-            axes.plot(
-                seconds, errors, "o", markersize=4, alpha=0.6,
-                label=f"{label}: {errors.mean():+.3f} ± {errors.std():.3f}°",
-            )  # fmt: skip
-        axes.axhspan(
-            -degrees(solve_statistics.HIT_RAD), degrees(solve_statistics.HIT_RAD), color="tab:green", alpha=0.08
-        )
-        axes.axhline(0.0, color="grey", linewidth=0.8)
-        axes.set_ylabel(f"{name} error, deg")
-        axes.legend(fontsize="small", loc="upper right")
-        axes.grid(alpha=0.3)
-    panels[-1].set_xlabel("middle of the slice, s after the first frame")
-    return png(figure)
+def _plot_chart(axes: Axes, chart: Chart) -> None:
+    for ground in chart.grounds:
+        colour = TONE_COLOURS[ground.tone]
+        axes.axvspan(ground.begin, ground.end, color=colour, alpha=0.3, linewidth=0, label=ground.name)
+    for series in chart.series:
+        x, y = np.array(series.points).reshape(-1, 2).T
+        drawn = "steps-post" if series.shape == "steps" else "default"
+        axes.plot(x, y, SHAPES[series.shape], drawstyle=drawn, markersize=4, alpha=0.7, label=series.name)
+    for limit in chart.limits:
+        axes.axhline(limit.at, color="grey", linestyle=":", label=limit.name)
+    for mark in chart.marks:
+        axes.axvline(mark.at, color="black", linestyle="--", linewidth=1.0)
+        top = axes.get_xaxis_transform()
+        axes.text(mark.at, 0.98, f"{mark.name} ", rotation=90, ha="right", va="top", fontsize="small", transform=top)
+    if chart.from_zero:
+        axes.set_ylim(bottom=0.0)
+    axes.set_title(chart.title, fontsize="medium")
+    axes.set_xlabel(chart.x_label)
+    axes.set_ylabel(chart.y_label)
+    axes.grid(alpha=0.3)
+    handles, labels = axes.get_legend_handles_labels()
+    by_label = dict(zip(labels, handles, strict=True))
+    axes.legend(by_label.values(), by_label.keys(), fontsize="small")
