@@ -82,25 +82,26 @@ def comparison_table(report: evaluation_schema.ComparisonReport) -> Table:
     """The methods side by side: a row per figure, with its unit last."""
     methods = list(report.methods.values())
 
-    def row(name: str, unit: str, values: Sequence[float | None], digits: int = 3, sign: bool = False) -> list[str]:
+    def row(name: str, unit: str, values: Sequence[float | None], digits: int, sign: bool = False) -> list[str]:
         return [name, *(number(value, digits, sign) for value in values), unit]
 
-    def errors(name: str, unit: str, spreads: Sequence[evaluation_schema.Spread]) -> list[list[str]]:
+    def errors(name: str, of_unit: str, spreads: Sequence[evaluation_schema.Spread]) -> list[list[str]]:
+        unit, digits = SHOWN_UNITS[of_unit], DIGITS[of_unit]
         return [
-            row(f"{name}, median", unit, [spread.median for spread in spreads]),
-            row(f"{name}, p95", unit, [spread.p95 for spread in spreads]),
-            row(f"{name}, max", unit, [spread.max for spread in spreads]),
+            row(f"{name}, median", unit, [spread.median for spread in spreads], digits),
+            row(f"{name}, 95 %", unit, [spread.p95 for spread in spreads], digits),
+            row(f"{name}, largest", unit, [spread.max for spread in spreads], digits),
         ]
 
     dof = methods[0].dof
     rows = [row("Hits", "%", [100 * method.hit_rate for method in methods], 1)]
-    rows += errors("Rotation error", "°", [method.rotation_deg for method in methods])
-    if dof == 6:
+    rows += errors("Rotation error", "deg", [method.rotation_deg for method in methods])
+    if dof == 6 or methods[0].start_translation_m > 0:
         rows += errors("Translation error", "m", [method.translation_m for method in methods])
     for axis in range(dof):
-        name, unit = AXIS_NAMES[axis], SHOWN_UNITS[UNITS[axis]]
-        rows.append(row(f"Bias of hits, {name}", unit, [method.bias[axis] for method in methods], sign=True))
-        rows.append(row(f"Std of hits, {name}", unit, [method.std[axis] for method in methods]))
+        name, unit, digits = AXIS_NAMES[axis], SHOWN_UNITS[UNITS[axis]], DIGITS[UNITS[axis]]
+        rows.append(row(f"Bias of hits, {name}", unit, [method.bias[axis] for method in methods], digits, sign=True))
+        rows.append(row(f"Std of hits, {name}", unit, [method.std[axis] for method in methods], digits))
     rows.append(row("Accepted misses", "", [method.verdicts.accepted_misses for method in methods], 0))
     rows.append(row("Classified correctly", "%", [100 * method.classified_correctly for method in methods], 1))
     rows.append(row("One solve, median", "s", [method.solve_s.median for method in methods], 2))
