@@ -481,8 +481,8 @@ def _plot_chart(axes: Axes, chart: Chart) -> None:
         axes.axvspan(ground.begin, ground.end, color=colour, alpha=0.3, linewidth=0, label=ground.name)
     for series in chart.series:
         x, y = np.array(series.points).reshape(-1, 2).T
-        drawn = "steps-post" if series.shape == "steps" else "default"
-        axes.plot(x, y, SHAPES[series.shape], drawstyle=drawn, markersize=4, alpha=0.7, label=series.name)
+        style = "steps-post" if series.shape == "steps" else "default"
+        axes.plot(x, y, SHAPES[series.shape], drawstyle=style, markersize=4, alpha=0.7, label=series.name)
     for limit in chart.limits:
         axes.axhline(limit.at, color="grey", linestyle=":", label=limit.name)
     for mark in chart.marks:
