@@ -12,6 +12,7 @@ from coec.calibration.objective.fused import Scale
 from coec.calibration.objective.landscape import Curvature
 from coec.calibration.objective.mutual_information import Evaluation
 from coec.calibration.search.change_point import ChangePoint
+from coec.calibration.search.local_search import SearchResult
 from coec.calibration.types import (
     INTRINSICS_OFF,
     MOVED,
@@ -19,17 +20,19 @@ from coec.calibration.types import (
     Metric,
     Reason,
     StopReason,
+    Uncertainty,
     Verdict,
 )
+from coec.calibration.uncertainty.covariance import AssessedOptimum
 from coec.calibration.uncertainty.posterior import Hypothesis, Posterior
 from coec.calibration.verdict import (
     change_metric,
     counted_once,
     intrinsics_metric,
     judge,
+    on_the_sharpest,
     repetition_metric,
     shape_metrics,
-    sharp_contrast,
 )
 from coec.config import VerdictConfig
 from coec.geometry import se3
@@ -188,12 +191,30 @@ def test_an_objective_without_edges_has_none_to_count_once() -> None:
     assert repetition_metric(None, LIMITS) == ()
 
 
-def test_the_sharpest_edges_count_where_lens_and_held_centre_are_most_probable() -> None:
+def on_sharp(significance: float, rivals: tuple[float, ...] = (), runner: float = 0.95) -> dict[str, float]:
+    """Edge contrast and runner-up on blurred and sharp edges; 4 of contrast at the optimum itself."""
+    unknown = Uncertainty.unknown()
+    search = SearchResult(np.eye(4), 10, TOLERANCE)
+    optimum = AssessedOptimum(
+        search, (), PEAK, posterior_of(significance=significance, nominal=1.0), None, rivals, unknown, SHARP
+    )
+    blurred = (OUTSTANDING[0], replace(OUTSTANDING[1], value=runner))
+    evaluation = replace(GOOD, edge_contrast=4.0)
+    return {m.name: m.value for m in on_the_sharpest(blurred, evaluation, Scale(mean=1.0, deviation=2.0), optimum)}
+
+
+def test_the_sharpest_edges_count_with_lens_and_held_centre_at_their_most_probable() -> None:
     """A held centre that is off by a centimetre displaces near edges by more than they are wide."""
-    at_optimum, scale = replace(GOOD, edge_contrast=4.0), Scale(mean=1.0, deviation=2.0)
-    assert sharp_contrast(at_optimum, scale, posterior_of(significance=17.0, nominal=1.0)) == 8.0
-    assert sharp_contrast(at_optimum, scale, posterior_of(significance=5.0, nominal=1.0)) == 4.0
-    assert sharp_contrast(at_optimum, None, None) == 4.0
+    assert on_sharp(17.0)["edge_contrast"] == 8.0
+    assert on_sharp(5.0)["edge_contrast"] == 4.0
+    assert on_sharp(40.0)["edge_contrast"] == OUTSTANDING[0].value
+
+
+def test_a_rival_that_only_blurred_edges_fit_is_none() -> None:
+    assert on_sharp(17.0, rivals=(9.0, 3.0))["runner_up"] == 0.5
+    assert on_sharp(17.0, rivals=(9.0, float("inf")))["runner_up"] == 0.95
+    assert on_sharp(17.0, rivals=(-5.0,))["runner_up"] == 0.0
+    assert on_sharp(17.0)["runner_up"] == 0.95
 
 
 def changed(gain: float = 9.0, turn_deg: float = 1.0, support: float = 8.0, likeness: float = 0.9) -> ChangePoint:

@@ -125,6 +125,9 @@ SAME_BASIN_RAD = radians(1.5)
 BETWEEN = (0.5, 0.75, 0.25)
 """Shares of the way from the pose to another summit at which a valley between them is looked for."""
 
+MOST_RIVALS = 10
+"""Most rivals that are compared on the sharpest edges: bounds the time. With more, a window is ambiguous."""
+
 MAX_GREY_WIDTH_PX = 800
 """Images are halved to at most this width before grey values are compared: pixels are then about as far apart as the
 points of a sweep."""
@@ -214,6 +217,7 @@ class EstimatorResult:
         metrics: those that only this objective has.
         edges: the edges of the window; None if it used none.
         edge_scale: of the significance of the sharpest edges at other poses; None likewise.
+        rivals: poses (4, 4) that are ambiguous with the one found as far as blurred edges tell.
         cues: what each cue contributed; empty if there is one only.
     """
 
@@ -222,6 +226,7 @@ class EstimatorResult:
     metrics: tuple[Metric, ...]
     edges: EdgeCue | None = None
     edge_scale: Scale | None = None
+    rivals: tuple[Matrix4, ...] = ()
     cues: tuple[CueShare, ...] = ()
 
 
@@ -267,16 +272,16 @@ def by_fusion(data: WindowData, config: CalibrationConfig) -> EstimatorResult:
     ranked = rank_basins(fusion, basins, window.start_known_to_rad)
     polished = polish_basins(fusion, ranked, config.search, data.progress)
     summits = choose_basin(fusion, polished, window)
-    edges = edges.balanced_at(summits[0])
-    contrast = basin_metrics(fusion, polished, summits[0], config)
-    if config.search.dof > TRANSLATIONS.start:
-        highest = highest_summit(edges, summits[0])
-        if highest is not summits[0]:
-            summits, edges = (highest, *summits), edges.balanced_at(highest)
+    edges, fusion = edges.balanced_at(summits[0]), fusion.about(summits[0])
+    contrast, rivals = basin_metrics(fusion, polished, summits[0], config)
+    held_m = config.verdict.held_translation_sigma_m if config.search.dof == TRANSLATIONS.start else None
+    highest = highest_summit(edges, summits[0], held_m)
+    if highest is not summits[0]:
+        summits, edges = (highest, *summits), edges.balanced_at(highest)
     count = Metric("range_edges", edges.effective_count, least_range_edges(config), at_least=True)
     objective, search = settle_basin(fusion, edges, summits, polished.evaluations, data, config)
     cues = objective.cue_shares(edges, search.T_camera_lidar, config.search.dof)
-    return EstimatorResult(objective, search, (count, *contrast), edges, objective.edge_scale, cues)
+    return EstimatorResult(objective, search, (count, *contrast), edges, objective.edge_scale, rivals, cues)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -392,16 +397,18 @@ def choose_basin(fusion: Fusion, polished: PolishedBasins, window: Window) -> tu
 
 def basin_metrics(
     fusion: Fusion, polished: PolishedBasins, pose: Matrix4, config: CalibrationConfig
-) -> tuple[Metric, ...]:
-    """How far the basin of a pose (4, 4) stands out from the others."""
-    contrast = fusion.edge_contrast(pose)
+) -> tuple[tuple[Metric, ...], tuple[Matrix4, ...]]:
+    """How far the basin of a pose (4, 4) stands out from the others, and the poses (4, 4) of those that it does not
+    stand out from; none of them if they are too many to be tried on the sharpest edges."""
+    contrast, limits = fusion.edge_contrast(pose), config.verdict
     others = (*polished.implausible, *(end.T_camera_lidar for end in polished.ends))
-    rival = _best_rival(fusion, [other for other in others if _differ(other, pose)], pose)
-    limits = config.verdict
-    return (
+    rivals = _rivals(fusion, [other for other in others if _differ(other, pose)], pose, limits.max_runner_up * contrast)
+    ties = tuple(other for rival, other in rivals if rival > limits.max_runner_up * contrast)
+    metrics = (
         Metric("edge_contrast", contrast, limits.min_edge_contrast, at_least=True),
-        Metric("runner_up", runner_up(contrast, rival), limits.max_runner_up, at_least=False),
+        Metric("runner_up", runner_up(contrast, [rival for rival, _ in rivals]), limits.max_runner_up, at_least=False),
     )
+    return metrics, ties if len(ties) <= MOST_RIVALS else ()
 
 
 def settle_basin(
@@ -432,19 +439,24 @@ def _with_ranks(fusion: Fusion, poses: Sequence[Matrix4]) -> list[RankedPose]:
     return [RankedPose(rank, pose) for rank, pose in zip(fusion.ranks(poses), poses, strict=True)]
 
 
-def _best_rival(fusion: Fusion, others: Sequence[Matrix4], pose: Matrix4) -> list[float]:
-    """The largest edge contrast among those of `others` (4, 4) that are summits beside `pose` (4, 4), in a list; an
-    empty list if none is a summit.
+def _rivals(fusion: Fusion, others: Sequence[Matrix4], pose: Matrix4, ambiguous: float) -> list[tuple[float, Matrix4]]:
+    """Edge contrasts and poses of those of `others` (4, 4) that are summits beside `pose` (4, 4), one for each basin:
+    all whose contrast is larger than `ambiguous`, else the largest one; an empty list if none is a summit.
 
     A climb may also end on the shoulder of the hill whose top is `pose`, because turns and shifts make up for each
     other. From a shoulder the way to the top never leads down, so it is no rival.
     """
+    rivals: list[tuple[float, Matrix4]] = []
     contrasts = fusion.edge_contrasts(np.array(others).reshape(-1, 4, 4))
     for contrast, other in sorted(zip(contrasts, others, strict=True), key=lambda item: -item[0]):
+        if rivals and contrast <= ambiguous:
+            break
+        if any(not _differ(other, known) for _, known in rivals):
+            continue
         difference = se3.difference(other, pose)
         if any(fusion.edge_contrast(se3.perturb(pose, share * difference)) < contrast for share in BETWEEN):
-            return [contrast]
-    return []
+            rivals.append((contrast, other))
+    return rivals
 
 
 def log_prior(T_camera_lidar: Matrix4, start: Matrix4, known_to_rad: float) -> float:

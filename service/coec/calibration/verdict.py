@@ -44,7 +44,7 @@ ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)
 COUNTED = "range_edges"
 """The figure that counts what the frames show; it counts the same thing again for each frame that shows it."""
 
-EDGE_CONTRAST = "edge_contrast"
+EDGE_CONTRAST, RUNNER_UP = "edge_contrast", "runner_up"
 """The figure that says whether the edges fit better than at other poses."""
 
 UNCERTAIN = frozenset({"sigma_deg", "sigma_m", COUNTED})
@@ -138,21 +138,26 @@ def intrinsics_metric(distribution: posterior.Posterior | None, limits: VerdictC
     return (Metric(INTRINSICS_OFF, certainty, limits.max_intrinsics_certainty, at_least=False),)
 
 
-def _also_on_the_sharpest(metrics: tuple[Metric, ...], sharp: float) -> tuple[Metric, ...]:
-    """The metrics of an objective, with the edge contrast of its basin on blurred edges, or `sharp` on the sharpest
-    ones, whichever is less: between boards and walls, blurred edges also fit where no sharp one does."""
-    return tuple(
-        replace(m, value=min(m.value, sharp)) if m.name == EDGE_CONTRAST and isfinite(sharp) else m for m in metrics
-    )
+def on_the_sharpest(
+    metrics: tuple[Metric, ...], evaluation: Evaluation, scale: Scale | None, optimum: AssessedOptimum
+) -> tuple[Metric, ...]:
+    """The metrics of an objective, with the edge contrast of its basin on blurred edges or on the sharpest ones,
+    whichever is less: between boards and walls, blurred edges also fit where no sharp one does. A rival likewise is one
+    only if it comes near on both.
 
-
-def sharp_contrast(evaluation: Evaluation, scale: Scale | None, distribution: posterior.Posterior | None) -> float:
-    """The edge contrast on the sharpest edges: at the optimum, where `evaluation` is that of the objective, or with
-    lens, clocks and held centre at their most probable, whichever is larger. Where all is near, a held centre that is
-    off by a centimetre displaces most edges by more than their width, and still the rotation is right."""
-    if scale is None or distribution is None:
-        return evaluation.edge_contrast
-    return max(evaluation.edge_contrast, scale.standard(distribution.significance))
+    The sharpest edges count at the optimum, where `evaluation` is that of the objective, or with lens, clocks and held
+    centre at their most probable, whichever is larger. Where all is near, a held centre that is off by a centimetre
+    displaces most edges by more than their width, and still the rotation is right.
+    """
+    if scale is None:
+        return metrics
+    contrast = evaluation.edge_contrast
+    if optimum.posterior is not None:
+        contrast = max(contrast, scale.standard(optimum.posterior.significance))
+    sharp = {EDGE_CONTRAST: contrast}
+    if optimum.rivals and contrast > 0.0:
+        sharp[RUNNER_UP] = max(0.0, *map(scale.standard, optimum.rivals)) / contrast
+    return tuple(replace(m, value=min(m.value, sharp.get(m.name, m.value))) for m in metrics)
 
 
 def _of_a_single_frame(metric: Metric) -> Metric:
@@ -175,10 +180,8 @@ def optimum_metrics(
     lines along the road. A single frame has nothing else, so its edge contrast has to be larger.
     """
     limits = config.verdict
-    of_edges = _also_on_the_sharpest(
-        counted_once(of_objective, optimum.uncertainty.independent_samples, len(pairs)),
-        sharp_contrast(evaluation, scale, optimum.posterior),
-    )
+    counted = counted_once(of_objective, optimum.uncertainty.independent_samples, len(pairs))
+    of_edges = on_the_sharpest(counted, evaluation, scale, optimum)
     repeats = config.search.dof == 6
     return (
         *(of_edges if repeats or len(pairs) > 1 else (_of_a_single_frame(metric) for metric in of_edges)),

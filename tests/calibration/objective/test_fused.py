@@ -193,6 +193,15 @@ def test_the_truth_stands_out_and_other_poses_are_spread_around_nought(sharp_str
     assert fusion.rank(truth) > max(fusion.rank(pose) for pose in others)
 
 
+def test_contrasts_about_a_pose_are_the_same_from_any_start(
+    sharp_street: Window, sharp_edges: EdgeCue, depth_cue: MutualInformation
+) -> None:
+    pose = sharp_street.rig.T_camera_lidar_nominal
+    starts = (from_start(sharp_street, seed, 8.0).T_camera_lidar_start for seed in (1, 2, 3))
+    contrasts = {Fusion(sharp_edges, depth_cue, start, REACH).about(pose).edge_contrast(pose) for start in starts}
+    assert len(contrasts) == 1
+
+
 def test_depth_that_does_not_vary_with_the_pose_leaves_the_edges_to_decide(
     sharp_street: Window, sharp_edges: EdgeCue
 ) -> None:

@@ -208,19 +208,37 @@ def test_a_pose_on_the_side_of_a_valley_is_led_to_the_summit_of_the_sharpest_edg
     # A shift upwards with the turn that leaves things at ten metres where they are; to the side it turns the other way.
     step[turned], step[shifted] = sign * np.radians(0.5), sign * (1 if turned == 0 else -1) * 10.0 * np.radians(0.5)
     off = se3.perturb(truth, step)
-    end = highest_summit(sharp_edges, off)
+    end = highest_summit(sharp_edges, off, None)
     of_truth, of_off, of_end = significances(sharp_edges.sharp, np.array([truth, off, end]))
     assert of_off < 0.8 * of_truth
     assert of_end > of_truth - SUMMIT_MARGIN
     assert angle_deg(end, truth) < 0.1
 
 
+@pytest.mark.parametrize("roll_deg", [-2.2, 1.4, 3.0])
+def test_a_rolled_pose_is_turned_to_the_summit_and_not_shifted(
+    sharp_street: Window, sharp_edges: EdgeCue, roll_deg: float
+) -> None:
+    truth = sharp_street.rig.T_camera_lidar_nominal
+    off = se3.perturb(truth, np.radians([0.3, -0.2, roll_deg, 0.0, 0.0, 0.0]))
+    end = highest_summit(sharp_edges, off, 0.01)
+    assert angle_deg(end, truth) < 0.1
+    assert np.allclose(se3.inverse(end)[:3, 3], se3.inverse(off)[:3, 3], atol=1e-9)
+
+
+def test_a_pose_is_left_where_the_error_of_the_held_centre_displaces_near_edges(
+    sharp_street: Window, sharp_edges: EdgeCue
+) -> None:
+    off = se3.perturb(sharp_street.rig.T_camera_lidar_nominal, np.radians([0.0, 0.0, 2.0, 0.0, 0.0, 0.0]))
+    assert highest_summit(sharp_edges, off, 0.1) is off
+
+
 def test_a_summit_is_left_where_it_is(sharp_street: Window, sharp_edges: EdgeCue) -> None:
-    summit = highest_summit(sharp_edges, sharp_street.rig.T_camera_lidar_nominal)
-    assert highest_summit(sharp_edges, summit) is summit
+    summit = highest_summit(sharp_edges, sharp_street.rig.T_camera_lidar_nominal, None)
+    assert highest_summit(sharp_edges, summit, None) is summit
 
 
 def test_edges_out_of_view_lead_nowhere(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     behind = se3.perturb(sharp_street.rig.T_camera_lidar_nominal, np.array([np.pi, 0.0, 0.0, 0.0, 0.0, 0.0]))
     alone = replace(sharp_edges, sharp=sharp_edges.sharp.of_points(np.zeros(0, np.int64)))
-    assert highest_summit(alone, behind) is behind
+    assert highest_summit(alone, behind, None) is behind

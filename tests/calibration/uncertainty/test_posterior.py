@@ -14,6 +14,7 @@ from coec.calibration.uncertainty.posterior import (
     NAMES,
     NOMINAL,
     OF_LENS,
+    Assumptions,
     Posterior,
     log_odds,
     measure_posterior,
@@ -46,7 +47,7 @@ def measured(
     held: Sequence[int] = (),
     known_m: float = KNOWN_M,
 ) -> Posterior:
-    result = measure_posterior(levels, corner_window(motions), pose, held, known_m, LENS_SIGMA)
+    result = measure_posterior(Assumptions(levels, corner_window(motions), held, known_m, LENS_SIGMA), pose)
     assert result is not None
     return result
 
@@ -170,7 +171,10 @@ def test_a_standing_vehicle_is_uninformative_of_its_clocks(rng: np.random.Genera
 def test_where_nothing_is_in_view_nothing_is_known(rng: np.random.Generator) -> None:
     behind = [-at for at in corner_points(rng)]
     levels = corner_edge_levels(corner_pixels(corner_points(rng)), behind)
-    assert measure_posterior(levels, corner_window(corner_motions()), IDENTITY_POSE, (), KNOWN_M, LENS_SIGMA) is None
+    assert (
+        measure_posterior(Assumptions(levels, corner_window(corner_motions()), (), KNOWN_M, LENS_SIGMA), IDENTITY_POSE)
+        is None
+    )
 
 
 def test_the_same_window_gives_the_same_bits(rng: np.random.Generator) -> None:
@@ -227,7 +231,7 @@ def test_an_uncertain_lens_makes_the_pose_uncertain(rng: np.random.Generator) ->
     levels, window = corner_edge_levels(corner_pixels(points), points), corner_window(corner_motions())
 
     def sigma_pitch(pixels: float) -> float:
-        result = measure_posterior(levels, window, IDENTITY_POSE, (), KNOWN_M, (pixels, 0.002))
+        result = measure_posterior(Assumptions(levels, window, (), KNOWN_M, (pixels, 0.002)), IDENTITY_POSE)
         assert result is not None
         return float(np.linalg.norm([one[0] for one in result.shifts(range(6)).values()]))
 
@@ -256,7 +260,7 @@ def test_one_frame_has_a_posterior(rng: np.random.Generator) -> None:
     (view, *_), window = corner_points(rng), corner_window(corner_motions(speed=0.0))
     alone: Window = replace(window, pairs=window.pairs[:1])
     levels = [replace(level, maps=level.maps[:1]) for level in corner_edge_levels(corner_pixels([view]), [view])]
-    result = measure_posterior(levels, alone, IDENTITY_POSE, ALL_HELD, KNOWN_M, LENS_SIGMA)
+    result = measure_posterior(Assumptions(levels, alone, ALL_HELD, KNOWN_M, LENS_SIGMA), IDENTITY_POSE)
     assert result is not None
     sigma: Array = np.sqrt(result.hypotheses[0].covariance.diagonal()[:3])
     assert (sigma < 0.01).all()

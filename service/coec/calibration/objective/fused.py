@@ -7,6 +7,7 @@ useless network adds only noise of one unit, and so does a scene without edges (
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from math import hypot, radians, sqrt
 
@@ -189,17 +190,27 @@ class Fusion:
         self.edges, self.depth, self.start, self.reach = edges, depth, start, reach
         poses = sample_reach(start, reach, OTHER_POSES)
         self._of_depth = Scale.of(np.array([at.score for at in depth.evaluate_each(poses)]))
-        of_edges = replace(reach, rotation_rad=max(reach.rotation_rad, OTHER_POSES_RAD))
-        self._poses = poses = sample_reach(start, of_edges, OTHER_POSES)
-        self._seen = mutual_information.SearchBox(
-            of_edges.rotation_rad + BEYOND.rotation_rad, of_edges.translation_m + BEYOND.translation_m
-        )
-        self._kinds = [(self._visible(*cue.bands), _scale_of_bands(cue, poses)) for cue in edges.kinds_alone]
-        of_bands = _scale_of_bands(edges, poses)
+        self._scale_about(start)
+        of_bands = _scale_of_bands(edges, self._poses)
         self.ranking = tuple(
             FusedObjective(band, blur_rad, depth, of_bands, self._of_depth)
             for band, blur_rad in zip(self._visible(*edges.bands[-2::-1]), edges.band_blur_rad[-2::-1], strict=True)
         )
+
+    def _scale_about(self, centre: Matrix4) -> None:
+        of_edges = replace(self.reach, rotation_rad=max(self.reach.rotation_rad, OTHER_POSES_RAD))
+        self._centre, self._poses = centre, sample_reach(centre, of_edges, OTHER_POSES)
+        self._seen = mutual_information.SearchBox(
+            of_edges.rotation_rad + BEYOND.rotation_rad, of_edges.translation_m + BEYOND.translation_m
+        )
+        self._kinds = [(self._visible(*cue.bands), _scale_of_bands(cue, self._poses)) for cue in self.edges.kinds_alone]
+
+    def about(self, pose: Matrix4) -> Fusion:
+        """The same with the contrasts of edges from other poses about `pose` (4, 4), where the search ended, instead of
+        its start: sixty poses give a deviation to an eighth, and from each start another one."""
+        fusion = copy(self)
+        fusion._scale_about(pose)
+        return fusion
 
     def settling(self, edges: EdgeCue) -> tuple[FusedObjective, FusedObjective]:
         """The objectives on which the best basin is polished in turn at the end: `edges` are those of this fusion,
@@ -212,7 +223,7 @@ class Fusion:
         )
 
     def _visible(self, *levels: alignment.EdgeFrames) -> tuple[alignment.EdgeFrames, ...]:
-        return tuple(in_reach(level, self.edges.half_view_rad, self.start, self._seen) for level in levels)
+        return tuple(in_reach(level, self.edges.half_view_rad, self._centre, self._seen) for level in levels)
 
     def edge_contrasts(self, poses: NDArray[np.float64]) -> list[float]:
         """How far the edge cue, averaged over its bands, stands above other poses at each of K poses (K, 4, 4);

@@ -181,8 +181,12 @@ def basin_next_to(edges: EdgeCue, pose: Matrix4, reach: SearchBox) -> Matrix4:
 SUMMIT_SPACING_RAD = (radians(1.0), radians(2.0), radians(4.0))
 """Shifts that lead to other summits of a basin, as angles seen from the nearest edges. See docs/measured.md."""
 
+SUMMIT_TURNED_RAD = (radians(1.0), radians(2.0), radians(3.0))
+"""Turns that do. See docs/measured.md."""
+
+SUMMIT_LEADING_RAD = (radians(0.4), radians(0.2), radians(0.1))
 SUMMIT_STEPS_RAD = (radians(0.2), radians(0.1), radians(0.05), radians(0.025))
-"""Steps of the climbs from there."""
+"""Steps of the climbs from there: on the finest band, and then on the sharpest edges."""
 
 SUMMIT_REACH = SearchBox(radians(5.0), 0.5)
 """How far these climbs may lead."""
@@ -193,31 +197,45 @@ SUMMIT_POINTS = 5_000
 SUMMIT_TURNS = 3
 """How often they begin again beside the end of the last ones."""
 
-SUMMIT_MARGIN = 1.0
-"""How much more significant another summit has to be, standard deviations: less may be chance."""
+SUMMIT_MARGIN, TURNED_MARGIN = 1.0, 3.0
+"""How much more significant another summit has to be, standard deviations: less may be chance. If the centre is
+held, it has to be more, because its error displaces the sharpest edges. See docs/measured.md."""
 
 
-def highest_summit(edges: EdgeCue, pose: Matrix4) -> Matrix4:
+def highest_summit(edges: EdgeCue, pose: Matrix4, held_m: float | None) -> Matrix4:
     """The most significant summit (4, 4) on the sharpest edges that climbs from `pose` (4, 4) and from beside it lead
     to.
 
-    Where all is near, a basin has several summits: turns and shifts make up for each other along a valley, and each
-    edge of a pattern along it meets one image edge after the other. Blurred edges show one summit where these are.
+    A basin may have several summits: where all is near, turns and shifts make up for each other along a valley, and
+    each edge of a pattern along it meets one image edge after the other; where all is far ahead, a roll displaces
+    little. Blurred edges show one summit where these are. `held_m` is the standard deviation of a centre of the camera
+    that is held. If that displaces near edges by more than they are wide, the sharpest ones tell no summits apart.
     """
     seen = in_reach(edges.sharp, edges.half_view_rad, pose, SUMMIT_REACH)
     few = seen.of_points(thinned(len(seen.weight), SUMMIT_POINTS))
-    near_m, unit = _near_m(few), np.eye(6)
+    near_m, unit, turns_only = _near_m(few), np.eye(6), held_m is not None
+    if held_m is not None and held_m > near_m * edges.blur_rad:
+        return pose
     turns, shifts = unit[:3], near_m * unit[3:]
-    one_way = np.array([*turns, *shifts, shifts[0] - turns[1], shifts[1] + turns[0]])
-    moves = np.array([[se3.perturbation(step * move) for move in (*one_way, *-one_way)] for step in SUMMIT_STEPS_RAD])
+    one_way = turns if turns_only else np.array([*turns, *shifts, shifts[0] - turns[1], shifts[1] + turns[0]])
+    turned = np.array([angle * turn for angle in SUMMIT_TURNED_RAD for turn in (*turns, *-turns)])
+    of_band, of_sharp = (
+        np.array([[se3.perturbation(step * move) for move in (*one_way, *-one_way)] for step in steps_rad])
+        for steps_rad in (SUMMIT_LEADING_RAD, SUMMIT_STEPS_RAD)
+    )
+    band = in_reach(edges.bands[0], edges.half_view_rad, pose, SUMMIT_REACH)
+    band = band.of_points(thinned(len(band.weight), SUMMIT_POINTS))
     highest = float(significances(seen, pose[None])[0])
     for _ in range(SUMMIT_TURNS):
-        starts = [pose, *(other for turn in SUMMIT_SPACING_RAD for other in shifted(pose[None], near_m * turn, near_m))]
-        ascents = ascend(few, [AscentStart(start, 0, len(few.maps)) for start in starts], moves)
+        starts = [pose, *(se3.perturb(pose, turn) for turn in turned)]
+        if not turns_only:
+            starts.extend(other for turn in SUMMIT_SPACING_RAD for other in shifted(pose[None], near_m * turn, near_m))
+        led = ascend(band, [AscentStart(start, 0, len(few.maps)) for start in starts], of_band)
+        ascents = ascend(few, [AscentStart(end.pose, 0, len(few.maps)) for end in led], of_sharp)
         ends = np.array([ascent.pose for ascent in ascents])
         z = significances(seen, ends)
         best = int(np.argmax(z))
-        if z[best] <= highest + SUMMIT_MARGIN:
+        if z[best] <= highest + (TURNED_MARGIN if turns_only else SUMMIT_MARGIN):
             break
         pose, highest = ends[best], float(z[best])
     return pose

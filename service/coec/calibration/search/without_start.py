@@ -230,7 +230,7 @@ def _with_rivals(result: EstimatorResult, rivals: Sequence[float]) -> EstimatorR
         replace(metric, value=max(metric.value, of_all)) if metric.name == "runner_up" else metric
         for metric in result.metrics
     )
-    return replace(result, metrics=tuple(metrics))
+    return replace(result, metrics=tuple(metrics), rivals=())
 
 
 def _stricter(config: CalibrationConfig) -> CalibrationConfig:

@@ -23,7 +23,7 @@ from coec.calibration.search import local_search
 from coec.calibration.search.local_search import TRANSLATIONS, SearchResult
 from coec.calibration.solver import EstimatorResult, WindowData
 from coec.calibration.types import Matrix4, Uncertainty, Window
-from coec.calibration.uncertainty.posterior import Posterior, measure_posterior
+from coec.calibration.uncertainty.posterior import Assumptions, Posterior, measure_posterior, significance_next_to
 from coec.calibration.uncertainty.systematic import OF_SENSORS, lens_error_px, sensor_resolution, systematic_shifts
 from coec.config import CalibrationConfig
 from coec.geometry import se3
@@ -238,6 +238,7 @@ class AssessedOptimum:
         curvature: of the objective where the search ended.
         posterior: of pose, lens and clocks; None if the estimator used no edges, or they determine no pose.
         independent: how many independent frames the window is worth; None if the estimator used no edges.
+        rivals: significances of the sharpest edges next to the rivals of the pose (see `EstimatorResult`).
         uncertainty: of the pose.
         sigma: (6,) its standard deviations, rad and m; NaN on axes that were not determined.
     """
@@ -247,6 +248,7 @@ class AssessedOptimum:
     curvature: Curvature
     posterior: Posterior | None
     independent: IndependentSamples | None
+    rivals: tuple[float, ...]
     uncertainty: Uncertainty
     sigma: NDArray[np.float64]
 
@@ -284,14 +286,17 @@ def _assessed(
     moved = tuple(axis for axis in range(dof) if axis not in blind)
     curvature = measure_curvature(objective, pose, dof, blind)
     posterior, independent, uncertainty = None, None, Uncertainty.unknown()
+    rivals: tuple[float, ...] = ()
     if edges is None:
         uncertainty = _scattered(objective, pose, moved, window, config.verdict.held_translation_sigma_m)
     else:
         independent = independent_samples_at(edges.sharp, pose)
         limits, fitted_px = config.verdict, lens_error_px(window.rig.camera_residual_px)
         lens = hypot(limits.principal_point_sigma * window.rig.camera.width, fitted_px), limits.focal_length_sigma
-        posterior = measure_posterior(edges.to_the_sharpest, window, pose, held, held_to_m, lens)
+        assumed = Assumptions(edges.to_the_sharpest, window, held, held_to_m, lens)
+        posterior = measure_posterior(assumed, pose)
+        rivals = tuple(significance_next_to(assumed, rival) for rival in result.rivals)
         if posterior is not None:
             uncertainty = _posterior_uncertainty(posterior, objective, pose, moved, window, independent.count)
             search = replace(search, T_camera_lidar=se3.perturb(pose, posterior.step(moved)))
-    return AssessedOptimum(search, blind, curvature, posterior, independent, uncertainty, uncertainty.sigma)
+    return AssessedOptimum(search, blind, curvature, posterior, independent, rivals, uncertainty, uncertainty.sigma)

@@ -14,7 +14,7 @@ prior odds.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from math import fsum, log, radians, sqrt
+from math import fsum, inf, log, radians, sqrt
 from types import MappingProxyType
 
 import numpy as np
@@ -190,28 +190,45 @@ def _at(axes: Sequence[int], values: Vector) -> Vector:
     return shift
 
 
-def measure_posterior(
-    edges: Sequence[EdgeFrames],
-    window: Window,
-    pose: Matrix4,
-    held: Sequence[int],
-    held_m: float,
-    lens_sigma: tuple[float, float],
-) -> Posterior | None:
-    """The posterior of a window; None if its edges determine no pose.
+@dataclass(frozen=True, slots=True, eq=False)
+class Assumptions:
+    """What is assumed of a window: its edges, and how well lens and held centre are known.
 
-    Args:
+    Attributes:
         edges: of the window, from coarser levels that lead to the sharpest one.
         window: the window.
-        pose: (4, 4) where its search ended.
         held: the translations (places in ξ) that were not searched.
         held_m: the standard deviation to which each of them is known.
         lens_sigma: standard deviations of the principal point, px, and of the focal length, as a share of it.
     """
-    levels = assumed_levels(edges, window, pose)
-    clocks = tuple(CLOCKS) if moves(window) else ()
-    places = (*TURNS, *SHIFTS, *clocks, *LENS)
-    priors = _priors(window, held, held_m, lens_sigma, moving=bool(clocks))
+
+    edges: Sequence[EdgeFrames]
+    window: Window
+    held: Sequence[int]
+    held_m: float
+    lens_sigma: tuple[float, float]
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        """The places of a deviation that are free."""
+        return (*TURNS, *SHIFTS, *(CLOCKS if moves(self.window) else ()), *LENS)
+
+
+def significance_next_to(assumed: Assumptions, pose: Matrix4) -> float:
+    """z of the edges at the most probable deviation from `pose` (4, 4) under the nominal hypothesis; infinite if they
+    determine none."""
+    levels, prior = assumed_levels(assumed.edges, assumed.window, pose), _priors(assumed)[NOMINAL]
+    try:
+        led = ascent(levels[-2:], np.zeros(SIZE), (*TURNS, *SHIFTS), prior, GENERAL_SHARE)
+        return ascent(levels[-1:], led.deviation, assumed.places, prior, GENERAL_SHARE).significance
+    except ValueError:
+        return inf
+
+
+def measure_posterior(assumed: Assumptions, pose: Matrix4) -> Posterior | None:
+    """The posterior of a window whose search ended at `pose` (4, 4); None if its edges determine no pose."""
+    levels = assumed_levels(assumed.edges, assumed.window, pose)
+    places, priors = assumed.places, _priors(assumed)
     try:
         fits = _fits(levels, places, priors)
     except ValueError:
@@ -229,22 +246,20 @@ def measure_posterior(
     )
 
 
-def _priors(
-    window: Window, held: Sequence[int], held_m: float, lens_sigma: tuple[float, float], *, moving: bool
-) -> dict[str, Vector]:
+def _priors(assumed: Assumptions) -> dict[str, Vector]:
     """(13,) standard deviations of the deviation, by hypothesis; the first is the nominal one."""
-    camera, (pixels, share) = window.rig.camera, lens_sigma
+    camera, (pixels, share) = assumed.window.rig.camera, assumed.lens_sigma
     nominal = np.empty(SIZE)
     nominal[TURNS], nominal[SHIFTS] = TURN_RAD, SHIFT_M
-    nominal[list(held)] = max(held_m, 1e-4)
+    nominal[list(assumed.held)] = max(assumed.held_m, 1e-4)
     nominal[CLOCKS] = CLOCKS_KNOWN
     nominal[LENS] = pixels / camera.fx, pixels / camera.fy, share, 0.5 * share
     others = {
         PRINCIPAL_POINT_OFF: (LENS[:2], (LENS_DRIFT, LENS_DRIFT)),
         FOCAL_LENGTH_OFF: (LENS[2:], (LENS_DRIFT, 0.5 * LENS_DRIFT)),
         LENS_OFF: (LENS, LENS_WRONG),
-        **({CLOCKS_OFF: (CLOCKS, CLOCKS_WRONG)} if moving else {}),
-        **({CENTRE_OFF: (SHIFTS, (CENTRE_WRONG_M,) * 3)} if held else {}),
+        **({CLOCKS_OFF: (CLOCKS, CLOCKS_WRONG)} if moves(assumed.window) else {}),
+        **({CENTRE_OFF: (SHIFTS, (CENTRE_WRONG_M,) * 3)} if assumed.held else {}),
     }
     priors = {NOMINAL: nominal}
     for name, (places, wide) in others.items():
