@@ -272,12 +272,15 @@ def by_fusion(data: WindowData, config: CalibrationConfig) -> EstimatorResult:
     ranked = rank_basins(fusion, basins, window.start_known_to_rad)
     polished = polish_basins(fusion, ranked, config.search, data.progress)
     summits = choose_basin(fusion, polished, window)
-    edges, fusion = edges.balanced_at(summits[0]), fusion.about(summits[0])
-    contrast, rivals = basin_metrics(fusion, polished, summits[0], config)
+    edges, basin = edges.balanced_at(summits[0]), summits[0]
     held_m = config.verdict.held_translation_sigma_m if config.search.dof == TRANSLATIONS.start else None
-    highest = highest_summit(edges, summits[0], held_m)
-    if highest is not summits[0]:
+    highest = highest_summit(edges, basin, held_m)
+    if highest is not basin:
         summits, edges = (highest, *summits), edges.balanced_at(highest)
+        # Within a basin, blurred edges have one summit.
+        basin = highest if _differ(highest, basin) else basin
+    fusion = fusion.about(basin)
+    contrast, rivals = basin_metrics(fusion, polished, basin, config)
     count = Metric("range_edges", edges.effective_count, least_range_edges(config), at_least=True)
     objective, search = settle_basin(fusion, edges, summits, polished.evaluations, data, config)
     cues = objective.cue_shares(edges, search.T_camera_lidar, config.search.dof)
