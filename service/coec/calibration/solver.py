@@ -404,9 +404,10 @@ def basin_metrics(
     """How far the basin of a pose (4, 4) stands out from the others, and the poses (4, 4) of those that it does not
     stand out from; none of them if they are too many to be tried on the sharpest edges."""
     contrast, limits = fusion.edge_contrast(pose), config.verdict
+    ambiguous = limits.max_runner_up * contrast
     others = (*polished.implausible, *(end.T_camera_lidar for end in polished.ends))
-    rivals = _rivals(fusion, [other for other in others if _differ(other, pose)], pose, limits.max_runner_up * contrast)
-    ties = tuple(other for rival, other in rivals if rival > limits.max_runner_up * contrast)
+    rivals = _rivals(fusion, [other for other in others if _differ(other, pose)], pose, ambiguous)
+    ties = tuple(other for rival, other in rivals if rival > ambiguous)
     metrics = (
         Metric("edge_contrast", contrast, limits.min_edge_contrast, at_least=True),
         Metric("runner_up", runner_up(contrast, [rival for rival, _ in rivals]), limits.max_runner_up, at_least=False),

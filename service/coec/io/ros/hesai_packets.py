@@ -366,6 +366,7 @@ class HesaiSensor:
     Attributes:
         elevation_rad, azimuth_rad: (lasers,) directions; azimuths count clockwise.
         is_nominal: whether these are those of the model.
+        pose: none, because the driver's messages name the frame of the points; see `PacketSensor`.
     """
 
     frame_id: str
@@ -373,11 +374,7 @@ class HesaiSensor:
     elevation_rad: NDArray[np.float64]
     azimuth_rad: NDArray[np.float64]
     is_nominal: bool
-
-    @property
-    def pose(self) -> tuple[str, Matrix4] | None:
-        """See `PacketSensor`: the driver's messages name the frame of the points."""
-        return None
+    pose: tuple[str, Matrix4] | None = None
 
     @property
     def notes(self) -> tuple[Recognition, ...]:

@@ -196,6 +196,7 @@ class RobosenseSensor:
     Attributes:
         elevation_rad, azimuth_rad: (lasers,) directions; azimuths count clockwise.
         is_dual: whether each firing has two returns.
+        pose, notes: none; see `PacketSensor`.
     """
 
     frame_id: str
@@ -203,16 +204,8 @@ class RobosenseSensor:
     elevation_rad: NDArray[np.float64]
     azimuth_rad: NDArray[np.float64]
     is_dual: bool
-
-    @property
-    def pose(self) -> tuple[str, Matrix4] | None:
-        """See `PacketSensor`."""
-        return None
-
-    @property
-    def notes(self) -> tuple[Recognition, ...]:
-        """See `PacketSensor`."""
-        return ()
+    pose: tuple[str, Matrix4] | None = None
+    notes: tuple[Recognition, ...] = ()
 
     def heads(self, glimpses: Sequence[bytes]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """See `PacketSensor`: a sweep begins where the driver says so, else where azimuths do."""
