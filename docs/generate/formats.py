@@ -3,9 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from typing import get_args
 
-from coec.io.recordings import bag_index, packet_streams
-from coec.io.ros import hesai_packets, messages, ouster_packets, packed_clouds, point_clouds, robosense_packets
+from coec.config import PacketMessage
+from coec.io.recordings import bag_index
+from coec.io.ros import (
+    hesai_packets,
+    messages,
+    ouster_packets,
+    packed_clouds,
+    packet_streams,
+    point_clouds,
+    robosense_packets,
+)
 from coec.io.ros.message_decoding import DEEP_COLOURS, ENCODINGS, KNOWN, REFUSED, SEMIPLANAR
 from coec.io.ros.translations import BY_SCHEMA
 from generate.markdown import WRITTEN, code, table
@@ -59,7 +69,7 @@ def _messages() -> Iterator[tuple[str, str, str, str]]:
         names = also.setdefault(translation.type_name, [])
         if encoding != "json" and schema not in names:
             names.append(schema)
-    live = {*KNOWN, messages.CAMERA_INFO, messages.TF}
+    live = {*KNOWN, *get_args(PacketMessage), messages.CAMERA_INFO, messages.TF}
     for name, gives in GIVES.items():
         yield code(name), _codes(sorted(also.get(name, ()))), gives, "yes" if name in live else ""
 

@@ -50,12 +50,12 @@ from coec.io.msgpack_frames import decode_camera, decode_ego, decode_lidar
 from coec.io.recordings.cloud_files import load_cloud
 from coec.io.recordings.kitti import read_numbers, read_stamps
 from coec.io.recordings.layouts import open_source
-from coec.io.recordings.packet_streams import PacketStream
 from coec.io.recordings.recording_source import RecordingSource
 from coec.io.rig_files import baseline_to_json, camera_of, load_baseline, rig_of, rig_to_json
 from coec.io.ros import message_decoding, message_encoding, messages
 from coec.io.ros.camera_info import decode_info, intrinsics_of_info
 from coec.io.ros.message_decoding import ENCODINGS
+from coec.io.ros.packet_streams import PacketStream
 from coec.io.ros.transforms import MovingFrame, StaticTransforms, decode_static_transforms, frames_in
 from coec.io.ros.translations import TRANSLATIONS, translation_of
 from coec.io.serialise import estimate_of, result_of

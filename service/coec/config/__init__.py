@@ -18,6 +18,7 @@ from coec.config.pair import (
     OpenEgoConfig,
     OpenLidarConfig,
     OpenPairConfig,
+    PacketMessage,
     PairConfig,
     PointTimeConfig,
     StreamConfig,

@@ -214,6 +214,16 @@ LidarMessage = Literal[
     "livox_ros_driver/msg/CustomMsg",
     "livox_interfaces/msg/CustomMsg",
 ]
+PacketMessage = Literal[
+    "velodyne_msgs/msg/VelodyneScan",
+    "ouster_sensor_msgs/msg/PacketMsg",
+    "ouster_msgs/msg/PacketMsg",
+    "ouster_ros/msg/PacketMsg",
+    "hesai_ros_driver/msg/UdpFrame",
+    "pandar_msgs/msg/PandarScan",
+    "nebula_msgs/msg/NebulaPackets",
+    "rslidar_msg/msg/RslidarPacket",
+]
 EgoMessage = Literal[
     "nav_msgs/msg/Odometry",
     "geometry_msgs/msg/TwistStamped",
@@ -309,7 +319,21 @@ class OpenLidarConfig(StreamConfig):
     """LiDAR stream of a pair that may leave out the LiDAR's frames, to be found on ROS 2 topics."""
 
     name: Name | None = Field(default=None, description="name of the LiDAR, the same in all its pairs; `links` use it")
-
+    type: LidarMessage | PacketMessage | None = Field(
+        default=None,
+        description="type of CDR messages that do not name theirs; by default PointCloud2. If set, a topic's messages "
+        "must have this type. Packets of a LiDAR are read if this names them, or if the name of the topic ends with "
+        "`packets`",
+    )
+    metadata: FilePath | None = Field(
+        default=None,
+        description="of a LiDAR whose packets are read: its metadata (Ouster, JSON) or correction file (Hesai, CSV)",
+    )
+    metadata_topic: TopicName | None = Field(
+        default=None,
+        description="topic that gives omitted `metadata`; by default `metadata` and `lidar_corrections` beside the "
+        "packets",
+    )
     frame_id: str | None = Field(
         default=None, max_length=128, description="frame of the LiDAR; clouds with another frame id are refused"
     )
@@ -332,14 +356,30 @@ class OpenLidarConfig(StreamConfig):
     )
 
     @property
-    def assumed_type(self) -> LidarMessage:
+    def has_packets(self) -> bool:
+        """Whether packets of a LiDAR are expected."""
+        return self.place.endswith("packets") if self.type is None else self.type in get_args(PacketMessage)
+
+    @property
+    def metadata_topics(self) -> tuple[str, ...]:
+        """Topics on which the LiDAR whose packets are read may say what it is."""
+        if self.topic is None or not self.has_packets or self.metadata is not None:
+            return ()
+        namespace = self.topic.rpartition("/")[0]
+        usual = (f"{namespace}/metadata", f"{namespace}/lidar_corrections")
+        return (self.metadata_topic,) if self.metadata_topic else usual
+
+    @property
+    def assumed_type(self) -> str:
         """The type of messages that do not name theirs."""
-        return "sensor_msgs/msg/PointCloud2"
+        return self.type or "sensor_msgs/msg/PointCloud2"
 
     @property
     def types(self) -> tuple[str, ...]:
         """The message types that this stream accepts."""
-        return _types(LidarMessage, None)
+        if self.topic is not None and self.type is not None:
+            return (self.type,)
+        return (*get_args(LidarMessage), *(get_args(PacketMessage) if self.has_packets else ()))
 
 
 class LidarConfig(OpenLidarConfig):

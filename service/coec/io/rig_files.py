@@ -43,11 +43,13 @@ def rig_of(pair: config.PairConfig) -> Rig:
     """The rig that a configuration describes; reads its mask.
 
     Raises:
-        ConfigError: the model refuses the intrinsics, a matrix is not rigid, or the mask is absent, not an image, or
-            not of the camera's size. Names the pair and the key.
+        ConfigError: the model refuses the intrinsics, a matrix is not rigid, `lidar.metadata` does not exist, or the
+            mask is absent, not an image, or not of the camera's size. Names the pair and the key.
     """
     camera = _camera(pair.camera.intrinsics, f"pair {pair.name}, camera.intrinsics")
     ego = pair.ego
+    if pair.lidar.metadata is not None:
+        require_readable(pair.lidar.metadata, f"pair {pair.name}, lidar.metadata")
     return Rig(
         pair=pair.name,
         camera=camera,
@@ -65,13 +67,15 @@ def check_given(pair: config.OpenPairConfig) -> None:
     """Checks the parts of an awaited pair's rig that the configuration gives, as far as possible without the rest.
 
     Raises:
-        ConfigError: the model refuses the intrinsics, a matrix is not rigid, or the mask does not exist.
+        ConfigError: the model refuses the intrinsics, a matrix is not rigid, or a file does not exist.
     """
     where = f"pair {pair.name}"
     if pair.camera.intrinsics is not None:
         _camera(pair.camera.intrinsics, f"{where}, camera.intrinsics")
     if pair.camera.mask is not None:
         require_readable(pair.camera.mask, f"{where}, camera.mask")
+    if pair.lidar.metadata is not None:
+        require_readable(pair.lidar.metadata, f"{where}, lidar.metadata")
     matrices = {
         "T_camera_lidar": pair.T_camera_lidar,
         "lidar.T_cloud_lidar": pair.lidar.T_cloud_lidar,

@@ -87,6 +87,7 @@ class ReceivedImage:
 @dataclass(slots=True)
 class ReceivedMetadata:
     """What was heard of one pair so far. `cloud` and `ego` are the frame names in the latest cloud and motion.
+    `packets` names the LiDAR whose packets came, with what is to be said of it.
     `names` has the frames that the latest messages of a stream (`camera`, `lidar`) name.
     `refused` says for a source (`camera`, `lidar`, `ego`, `info`) why its latest message could not be used.
     `max_message_bytes` is the largest message that the session lets through."""
@@ -94,6 +95,7 @@ class ReceivedMetadata:
     image: ReceivedImage | None = None
     cloud: str | None = None
     ego: str | None = None
+    packets: str = ""
     info: CameraInfoContent | None = None
     names: dict[str, deque[str]] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
@@ -253,6 +255,8 @@ class _Search:
         self._require_one_frame("lidar", "clouds", lidar, "lidar.cloud_frame_id")
         if lidar.frame_id is None:
             self.origins[LIDAR_FRAME] = f"the latest cloud on {lidar.place} before the pair was built"
+            if self._received.packets:
+                self.origins[LIDAR_FRAME] = f"packets on {lidar.place}: {self._received.packets}"
         return cloud
 
     def T_cloud_lidar(self, cloud: str | None, lidar: str | None) -> Matrix4x4 | None:

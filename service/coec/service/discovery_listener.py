@@ -19,11 +19,12 @@ from coec.errors import DecodeError
 from coec.io.logs import loss_text
 from coec.io.ros import messages
 from coec.io.ros.camera_info import MAX_INFO_BYTES, decode_info
-from coec.io.ros.transforms import MAX_MESSAGE_BYTES, StaticTransforms, decode_static_transforms
+from coec.io.ros.packet_streams import PacketSensor, is_description
+from coec.io.ros.transforms import MAX_MESSAGE_BYTES, StaticTransform, StaticTransforms, decode_static_transforms
 from coec.io.system import ServiceThread
 from coec.io.zenoh.bus import CDR, InputSample
 from coec.service.discovery import DiscoveredPair, ReceivedImage, ReceivedMetadata, change_since, discover
-from coec.service.ingest.decoder import CAMERA, SampleReader
+from coec.service.ingest.decoder import CAMERA, EXPLAINED, LIDAR, SampleReader
 
 _log = logging.getLogger(__name__)
 
@@ -45,6 +46,9 @@ IDLE_S = 0.25
 
 INFO = "info"
 """Place of a loss: a `CameraInfo`. The streams `camera` and so on are places, too."""
+
+DESCRIPTION = "description"
+"""Place of a loss: a message in which a LiDAR says what it is."""
 
 TRANSFORMS = "tf_static"
 """Place of a loss: a message of static transforms."""
@@ -152,9 +156,11 @@ class DiscoveryListener:
             self._latest[pair, INFO] = bounded
 
     def take_frame(self, pair: str, stream: str, sample: InputSample) -> None:
-        """A frame of a pair that is awaited came; the newest counts."""
+        """A frame of a pair that is awaited came, or a packet, or what a LiDAR says of itself; the newest of each
+        counts."""
+        of_packets = stream == LIDAR and self._pairs[pair].pair.lidar.has_packets
         with self._condition:
-            self._latest[pair, stream] = sample
+            self._latest[pair, DESCRIPTION if of_packets and is_description(sample.payload) else stream] = sample
 
     # --- on any -----------------------------------------------------------------------------------------------------
 
@@ -219,8 +225,8 @@ class DiscoveryListener:
             self._transforms.refuse(decoded.refused)
             self._transforms.add(decoded.joints)
 
-        cause = _attempt(add)
-        for lost in (*refused, *([] if cause is None else [cause])):
+        error = _attempt(add)
+        for lost in (*refused, *([] if error is None else [error.reason])):
             with self._condition:
                 self._transforms_lost[lost] += 1
                 count = self._transforms_lost[lost]
@@ -230,13 +236,13 @@ class DiscoveryListener:
         if each.built and stream != INFO:
             return
         take = self._take_info if stream == INFO else self._take_frame
-        cause = _attempt(lambda: take(each, stream, sample))
+        error = _attempt(lambda: take(each, stream, sample))
         refused = each.received.refused
-        if cause is None:
+        if error is None:
             each.news |= refused.pop(stream, None) is not None
             return
-        refused[stream] = cause
-        each.count_loss(stream, cause)
+        refused[stream] = str(error) if error.reason in EXPLAINED else error.reason
+        each.count_loss(stream, error.reason)
 
     def _take_info(self, each: _PendingPair, stream: str, sample: InputSample) -> None:
         del stream
@@ -253,9 +259,18 @@ class DiscoveryListener:
             each.count_loss(CAMERA, "message_too_large")  # an image above `limits.max_message_bytes`
 
     def _take_frame(self, each: _PendingPair, stream: str, sample: InputSample) -> None:
-        received = each.received
-        before = (received.image, received.cloud, received.ego, _names(received))
-        match each.samples[stream].frame(sample):
+        received, reader = each.received, each.samples[LIDAR if stream == DESCRIPTION else stream]
+        before = (received.image, received.cloud, received.ego, received.packets, _names(received))
+        frame = reader.frame(sample)
+        if stream == LIDAR and reader.packets is not None and reader.packets.sensor is not None:
+            # Of a turn, some packets come here: enough to know the sensor.
+            sensor = reader.packets.sensor
+            received.packets = " ".join((f"{sensor.name}.", *(note.text for note in reader.packets.notes)))
+            received.cloud = sensor.frame_id
+            received.add_name(stream, sensor.frame_id)
+            self._place(sensor)
+            frame = None
+        match frame:
             case CameraFrame() as frame:
                 received.image = ReceivedImage(frame.frame_id, frame.image.width, frame.image.height)
                 received.add_name(stream, frame.frame_id)
@@ -264,7 +279,13 @@ class DiscoveryListener:
                 received.add_name(stream, frame.frame_id)
             case EgoMotion() as frame:
                 received.ego = frame.frame_id
-        each.news |= before != (received.image, received.cloud, received.ego, _names(received))
+        each.news |= before != (received.image, received.cloud, received.ego, received.packets, _names(received))
+
+    def _place(self, sensor: PacketSensor) -> None:
+        """Adds where the sensor says that its frame is, if nobody else does."""
+        frames = self._transforms.frames
+        if sensor.pose is not None and sensor.frame_id not in frames and sensor.pose[0] in frames:
+            self._transforms.add((StaticTransform(sensor.pose[0], sensor.frame_id, sensor.pose[1]),))
 
     def _nominal(self, each: _PendingPair) -> NominalStatus:
         each.news = False
@@ -293,15 +314,15 @@ def _names(received: ReceivedMetadata) -> set[tuple[str, str]]:
     return {(stream, name) for stream, names in received.names.items() for name in names}
 
 
-def _attempt(take: Callable[[], None]) -> str | None:
-    """Takes a sample; returns the cause if that fails. A fault of a decoder costs the sample, not the service."""
+def _attempt(take: Callable[[], None]) -> DecodeError | None:
+    """Takes a sample; returns the error if that fails. A fault of a decoder costs the sample, not the service."""
     try:
         take()
     except DecodeError as error:
-        return error.reason
+        return error
     except Exception:
         _log.exception("a decoder failed")
-        return "decoder_fault"
+        return DecodeError("decoder_fault", "the decoder failed: its log says why")
     return None
 
 

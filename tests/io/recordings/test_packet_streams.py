@@ -135,7 +135,7 @@ def test_ros_1_is_the_same(tmp_path: Path) -> None:
 def test_without_metadata_the_error_says_what_to_do(tmp_path: Path) -> None:
     path = write_entries(tmp_path / "drive.mcap", [*others(), *packets()])
     for query in ("", f"?points={PACKETS}"):
-        with pytest.raises(SourceError, match=rf"{PACKETS}.* has packets of a LiDAR: .*no metadata: record .* or give"):
+        with pytest.raises(SourceError, match=rf"{PACKETS}.* has packets of a LiDAR: .*no metadata: .* or give"):
             open_source(f"{path}{query}")
     saved = tmp_path / "os.json"
     saved.write_bytes(SENSOR.metadata())

@@ -289,9 +289,7 @@ def test_a_type_that_is_not_read_is_refused() -> None:
     ("type_name", "advice"),
     [
         ("ffmpeg_image_transport_msgs/msg/FFMPEGPacket", "JPEG"),
-        ("ouster_sensor_msgs/msg/PacketMsg", "recordings only: take the topic of PointCloud2"),
-        ("hesai_ros_driver/msg/UdpFrame", "recordings only: take .* of hesai_ros_driver or nebula_ros"),
-        ("rslidar_msg/msg/RslidarPacket", "recordings only: take .* of rslidar_sdk"),
+        ("ouster_sensor_msgs/msg/PacketMsg", "lidar.type: ouster_sensor_msgs/msg/PacketMsg"),
         ("rslidar_msgs/msg/rslidarScan", "msg_source: 2"),
     ],
 )

@@ -9,11 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coec.config import LimitsConfig
 from coec.errors import DecodeError
-from coec.io.ros.message_decoding import decode
 from coec.io.ros.ouster_packets import OusterSensor, glimpse
-from support.packets import OUSTER, PIXELS, Ouster, ouster_message
+from support.packets import PIXELS, Ouster, ouster_message
 from support.ros import STAMP_NS
 
 STEP_NS = 1_562_500
@@ -143,8 +141,3 @@ def test_damaged_packets_raise_nothing_else(place: int, value: bytes, profile: s
     assert np.isfinite(sweep.xyz_m).all()
     assert sweep.time_offset_s is not None
     assert np.abs(sweep.time_offset_s).max() <= 10.0
-
-
-def test_live_the_drivers_topic_of_points_is_named() -> None:
-    with pytest.raises(DecodeError, match="read from recordings only: take the topic of PointCloud2 of ouster_ros"):
-        decode(OUSTER, turn(Ouster())[0], LimitsConfig())

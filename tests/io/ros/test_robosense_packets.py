@@ -8,12 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coec.calibration.types import LidarFrame
-from coec.config import LimitsConfig
 from coec.errors import DecodeError
 from coec.io.ros import robosense_packets
-from coec.io.ros.message_decoding import decode
 from coec.io.ros.robosense_packets import RobosenseSensor
-from support.packets import HELIOS, ROBOSENSE, ROBOSENSES, RS_16, RS_32, Robosense, robosense_message
+from support.packets import HELIOS, ROBOSENSES, RS_16, RS_32, Robosense, robosense_message
 
 BEGIN_NS = 1_700_000_000 * 10**9 + 123_456_000
 BLOCKS = 36
@@ -117,7 +115,7 @@ def test_directions_may_come_late_or_from_a_file() -> None:
     second = sensor_of(messages, b"\0\0" + RS_32.difop())
     np.testing.assert_array_equal(first.elevation_rad, second.elevation_rad)
     for without in (messages, [*messages, blank]):
-        with pytest.raises(DecodeError, match="no DIFOP packet with the directions of its lasers: record those too"):
+        with pytest.raises(DecodeError, match="no DIFOP packet with the directions of its lasers: record or"):
             sensor_of(without)
 
 
@@ -158,8 +156,3 @@ def test_damaged_packets_raise_nothing_else(place: int, value: bytes, name: str,
     assert np.isfinite(sweep.xyz_m).all()
     assert sweep.time_offset_s is not None
     assert np.abs(sweep.time_offset_s).max() <= 10.0
-
-
-def test_live_the_drivers_topic_of_points_is_named() -> None:
-    with pytest.raises(DecodeError, match="take the topic of PointCloud2 of rslidar_sdk"):
-        decode(ROBOSENSE, turn(RS_16)[1][0], LimitsConfig())

@@ -9,10 +9,12 @@ from contextlib import ExitStack
 import pytest
 import zenoh
 
-from coec.config import Config, LimitsConfig, ZenohConfig
+from coec.config import Config, LimitsConfig, OpenLidarConfig, ZenohConfig
+from coec.io.ros.messages import OUSTER_PACKETS, STRING
+from coec.io.ros.wire_format import Qos
 from coec.io.zenoh import ros_node
 from coec.io.zenoh.bus import Bus, open_session
-from coec.io.zenoh.ros_node import RosSide, RosTopicList, listed
+from coec.io.zenoh.ros_node import RosPublishers, RosSide, RosTopicList, listed
 from coec.schemas.keys import ros_name
 from support.fake_worker import wait_until
 from support.router import free_port
@@ -209,3 +211,32 @@ def test_who_is_missing_is_reported_with_those_who_are_there(session: zenoh.Sess
 def test_a_sentence_names_a_few() -> None:
     assert listed([f"/{number}" for number in range(3)]) == "/0, /1, /2"
     assert listed([f"/{number}" for number in range(30)]) == "/0, /1, /2, /3, /4, /5, /6, /7 and 22 more"
+
+
+def test_metadata_that_were_published_before_come_with_the_packets_of_their_lidar(
+    session: zenoh.Session, side: RosSide, endpoint: str
+) -> None:
+    lidar = OpenLidarConfig(topic="/ouster/lidar_packets")
+    with ExitStack() as stack:
+        driver = stack.enter_context(open_session(ZenohConfig(connect=(endpoint,)), LimitsConfig()))
+        node = RosSide(driver, configured("rmw_zenoh", "driver"))
+        stack.callback(node.close)
+        assert node.node is not None
+        publishers = RosPublishers(driver, node.node)
+        stack.callback(publishers.close)
+        publishers.publisher("/ouster/metadata", STRING, Qos(transient_local=True, depth=1)).put(b"metadata", 1)
+        packets = publishers.publisher("/ouster/lidar_packets", OUSTER_PACKETS[0], Qos(depth=1))
+        received: list[tuple[bytes, str]] = []
+        bus = Bus(session)
+        end = bus.subscribe(side.input_of(lidar), lambda sample: received.append((sample.payload, sample.encoding)))
+
+        def all_received() -> bool:
+            packets.put(b"packet", 1)
+            return len(set(received)) == 2
+
+        wait_until(all_received, "both are received")
+        assert set(received) == {
+            (b"metadata", "application/cdr;std_msgs/msg/String"),
+            (b"packet", f"application/cdr;{OUSTER_PACKETS[0]}"),
+        }
+        end()

@@ -17,7 +17,7 @@ import zenoh
 
 from coec.calibration.types import CameraFrame, Frame, LidarFrame
 from coec.cli.doctor.environment import cause_of_silence, fail, ok, warn
-from coec.config import CameraMessage, Config, EgoMessage, LidarMessage, PairConfig
+from coec.config import CameraMessage, Config, EgoMessage, LidarMessage, PacketMessage, PairConfig
 from coec.errors import DecodeError
 from coec.io.depth.depth_maps import STEREO
 from coec.io.images import Inspector
@@ -29,7 +29,7 @@ from coec.schemas.documents import Finding
 from coec.schemas.keys import TF_STATIC
 from coec.service.api.problems import PROBLEMS, stream_problems
 from coec.service.discovery import info_topic_of, needs_transforms
-from coec.service.ingest.decoder import CAMERA, EGO, LIDAR, Decoder, StreamCounts
+from coec.service.ingest.decoder import CAMERA, EGO, LIDAR, PACKETS_WAITING, Decoder, StreamCounts
 
 SAMPLES_WAITING = 8
 """Most samples of a stream that wait to be decoded; further ones are only counted."""
@@ -58,7 +58,9 @@ PERIOD = 0.1
 LARGE = 0.8
 """Share of the largest accepted message from which on there is a warning."""
 
-STREAM_TYPES = frozenset((*get_args(CameraMessage), *get_args(LidarMessage), *get_args(EgoMessage)))
+STREAM_TYPES = frozenset(
+    name for known in (CameraMessage, LidarMessage, PacketMessage, EgoMessage) for name in get_args(known)
+)
 """Message types that a stream may have."""
 
 NAMED = 40
@@ -188,17 +190,16 @@ class _PairSubscription:
         self.samples = {
             name: StreamSamples(stream.place, inputs[name].expressions) for name, stream in pair.streams.items()
         }
+        depths = {EGO: MOTIONS_WAITING, LIDAR: PACKETS_WAITING if pair.lidar.has_packets else SAMPLES_WAITING}
         self._waiting: dict[str, deque[tuple[int, InputSample]]] = {
-            name: deque(maxlen=MOTIONS_WAITING if name == EGO else SAMPLES_WAITING) for name in self.samples
+            name: deque(maxlen=depths.get(name, SAMPLES_WAITING)) for name in self.samples
         }
         self._losses = LossCounter(_SILENT, pair.name)
         self._decoders = {
             name: Decoder(name, stream, config.limits, self._losses) for name, stream in pair.streams.items()
         }
         self._subscribers = [
-            self._subscribe(session, expression, stream.read, name)
-            for name, stream in inputs.items()
-            for expression in stream.expressions
+            one for name, stream in inputs.items() for one in stream.declared(session, self._receiver(name, stream))
         ]
         tokens = [stream.token for stream in inputs.values() if stream.token is not None]
         self._tokens = [session.liveliness().declare_token(token) for token in tokens]
@@ -236,19 +237,18 @@ class _PairSubscription:
             )
         return any_sample
 
-    def _subscribe(
-        self, session: zenoh.Session, expression: str, read: Callable[[zenoh.Sample], InputSample], name: str
-    ) -> zenoh.Subscriber[None]:
+    def _receiver(self, name: str, stream: StreamInput) -> Callable[[zenoh.Sample, bool], None]:
         samples, waiting = self.samples[name], self._waiting[name]
 
-        def receive(sample: zenoh.Sample) -> None:
+        def receive(sample: zenoh.Sample, is_description: bool) -> None:
             if sample.kind != zenoh.SampleKind.PUT or len(samples.arrivals_s) >= SAMPLES_COUNTED:
                 return
-            received = read(sample)
-            samples.count(received)
+            received = stream.sample(sample, is_description)
+            if not is_description:
+                samples.count(received)
             waiting.append((time.time_ns(), received))
 
-        return session.declare_subscriber(expression, direct(receive))
+        return receive
 
 
 def stream_findings(
@@ -266,7 +266,7 @@ def stream_findings(
     if camera.stamps and ego is not None and ego.stamps:
         yield _with_motion(pair, camera.stamps, ego.stamps)
     if isinstance(lidar.latest, LidarFrame):
-        yield _point_times(pair, lidar.latest, lidar.rate_hz)
+        yield _point_times(pair, lidar.latest, None if pair.lidar.has_packets else lidar.rate_hz)
     if isinstance(camera.latest, CameraFrame):
         yield from _image(pair, camera.latest, config)
 

@@ -30,12 +30,12 @@ from coec.io.recordings.layouts import RecordingSource
 from coec.io.recordings.window_cutting import RECORDED_GAP_S
 from coec.io.serialise import degrees_or_null, matrix_of
 from coec.io.user_files import read_bytes
-from coec.io.zenoh.bus import StreamInput, direct, input_of
+from coec.io.zenoh.bus import StreamInput, Undeclarable, direct, input_of
 from coec.io.zenoh.player import repeated, shifted
 from coec.schemas.keys import Keys
 from coec.schemas.message import from_json, from_msgpack
 from coec.schemas.replies import AxisReply, CalibrationResult, ExtrinsicReply, HealthReply, MetricReply, Transform
-from coec.service.ingest.decoder import CAMERA, EGO, LIDAR, Decoder
+from coec.service.ingest.decoder import CAMERA, EGO, LIDAR, PACKETS_WAITING, Decoder
 from coec.service.ingest.inbox import Inbox, Parcel
 
 NS_PER_S = 1_000_000_000
@@ -571,7 +571,7 @@ class SensorStreams:
         self._limits = config.limits
         self._losses = LossCounter(_SILENT, pair.name)
         self._inputs = {name: input_of(stream, config) for name, stream in pair.streams.items()}
-        self._subscribers: list[zenoh.Subscriber[None]] = []
+        self._subscribers: list[Undeclarable] = []
         self._begin()
 
     def _begin(self) -> None:
@@ -580,7 +580,8 @@ class SensorStreams:
         }
         self._pairer = Pairer(self._pair.pairing, expects_motion=self._pair.ego is not None)
         self._since_s = time.monotonic()
-        self._inbox = Inbox(DEPTHS, self._limits.max_waiting_bytes, self._overrun)
+        depths = {**DEPTHS, LIDAR: PACKETS_WAITING} if self._pair.lidar.has_packets else DEPTHS
+        self._inbox = Inbox(depths, self._limits.max_waiting_bytes, self._overrun)
 
     @property
     def not_shown(self) -> Counter[tuple[str, str]]:
@@ -612,9 +613,9 @@ class SensorStreams:
         if enabled and not self._subscribers:
             self._begin()
             self._subscribers = [
-                self._subscribe(name, key, source)
+                subscriber
                 for name, source in self._inputs.items()
-                for key in source.expressions
+                for subscriber in source.declared(self._session, self._receiver(name, source))
             ]
         elif not enabled:
             self.close()
@@ -645,15 +646,15 @@ class SensorStreams:
             subscriber.undeclare()
         self._subscribers = []
 
-    def _subscribe(self, stream: str, key: str, source: StreamInput) -> zenoh.Subscriber[None]:
+    def _receiver(self, stream: str, source: StreamInput) -> Callable[[zenoh.Sample, bool], None]:
         inbox = self._inbox
 
-        def receive(sample: zenoh.Sample) -> None:
+        def receive(sample: zenoh.Sample, is_description: bool) -> None:
             if sample.kind != zenoh.SampleKind.PUT:
                 return
             if len(sample.payload) > self._limits.max_message_bytes:
                 self._losses.add(stream, "message_too_large")
                 return
-            inbox.put(stream, source.read(sample))
+            inbox.put(stream, source.sample(sample, is_description))
 
-        return self._session.declare_subscriber(key, direct(receive))
+        return receive

@@ -23,11 +23,10 @@ from pydantic import ValidationError
 from coec.calibration.types import EgoMotion, Frame, Matrix4, Recognition
 from coec.config import LimitsConfig, PointTimeConfig, describe
 from coec.errors import DecodeError, SourceError, UsageError
-from coec.io.recordings import packet_streams
 from coec.io.recordings.bag_storage import MAX_MESSAGE_BYTES, BagMessage, BagReader, BagStorage
-from coec.io.recordings.packet_streams import MAX_DESCRIPTION_BYTES, PacketStream, PacketSweep
-from coec.io.ros import camera_info, message_decoding, messages, packed_clouds, point_clouds
+from coec.io.ros import camera_info, message_decoding, messages, packed_clouds, packet_streams, point_clouds
 from coec.io.ros import transforms as ros_transforms
+from coec.io.ros.packet_streams import MAX_DESCRIPTION_BYTES, PacketStream, PacketSweep
 from coec.io.user_files import expand_home
 from coec.io.video import VideoTrack, codec_of
 from coec.schemas.keys import TF_STATIC

@@ -44,8 +44,9 @@ MAX_PACKET_BYTES: Final = 2048
 """Most bytes of a packet; an Ethernet frame has 1500."""
 
 CORRECTIONS: Final = (
-    "give its correction file with ?metadata=FILE (CSV of elevations and azimuths, from the web page of the LiDAR), or "
-    "let hesai_ros_driver publish it (ros_send_correction_topic) and record that, too"
+    "give its correction file (CSV of elevations and azimuths, from the web page of the LiDAR): ?metadata=FILE of a "
+    "recording, lidar.metadata of the service; or let hesai_ros_driver publish it (ros_send_correction_topic), and "
+    "record that, too"
 )
 
 
@@ -377,6 +378,11 @@ class HesaiSensor:
     pose: tuple[str, Matrix4] | None = None
 
     @property
+    def name(self) -> str:
+        """See `PacketSensor`."""
+        return f"Hesai {self.model.name}"
+
+    @property
     def notes(self) -> tuple[Recognition, ...]:
         """See `PacketSensor`."""
         if not self.is_nominal:
@@ -445,8 +451,7 @@ class HesaiSensor:
 
     def _times_ns(self, packets: NDArray[Any]) -> NDArray[np.int64]:
         """(packets, blocks) time of each block by the sensor's clock."""
-        dates, which = np.unique(packets["date"], axis=0, return_inverse=True)
-        seconds = np.array([_seconds(*date.tolist()) for date in dates], np.int64)[which.ravel()]
+        seconds = np.array([_seconds(*date) for date in packets["date"].tolist()], np.int64)
         model, block = self.model, np.arange(self.model.blocks)
         returns = _returns(packets)[:, None]
         steps = block // returns if model is _PANDAR_QT else -((model.blocks - 1 - block) // returns)
@@ -462,6 +467,7 @@ def _returns(packets: NDArray[Any]) -> NDArray[np.int64]:
     return returns
 
 
+@functools.lru_cache
 def _seconds(year: int, month: int, day: int, hour: int, minute: int, second: int) -> int:
     """Seconds since 1970 of a date whose year counts from 1900 or 2000; or big-endian in the last four bytes."""
     if year == month == 0:

@@ -327,20 +327,16 @@ _PACKED: Final = f"packed clouds are read from recordings only: {packed_clouds.U
 _PACKETS: Final = (
     "packets of the LiDAR are no points: take the topic of PointCloud2 of its driver, or convert them with "
 )
-_RECORDED: Final = "packets of a LiDAR are read from recordings only: take the topic of PointCloud2 of "
 
 REFUSED: Final = {
     messages.FFMPEG_PACKET: _VIDEO,
     messages.COMPRESSED_VIDEO: _VIDEO,
     messages.FOXGLOVE_CLOUD: _PACKED,
     "theora_image_transport/msg/Packet": _VIDEO,
-    messages.VELODYNE_SCAN: f"{_PACKETS}velodyne_pointcloud (velodyne_transform_node)",
-    **dict.fromkeys(messages.OUSTER_PACKETS, f"{_RECORDED}ouster_ros"),
-    **dict.fromkeys(
-        (messages.HESAI_PACKETS, messages.PANDAR_PACKETS, messages.NEBULA_PACKETS),
-        f"{_RECORDED}hesai_ros_driver or nebula_ros",
-    ),
-    messages.ROBOSENSE_PACKET: f"{_RECORDED}rslidar_sdk",
+    **{
+        name: f"packets of a LiDAR are read if the configuration says so: lidar.type: {name}"
+        for name in (messages.VELODYNE_SCAN, *messages.OUSTER_PACKETS, *messages.HESAI, messages.ROBOSENSE_PACKET)
+    },
     "rslidar_msgs/msg/rslidarScan": f"{_PACKETS}rslidar_sdk, `msg_source: 2` in its config.yaml (packets from ROS)",
     messages.COMPRESSED_CLOUD: _PACKED,
     "sensor_msgs/msg/PointCloud": "PointCloud has been replaced by PointCloud2: convert it (point_cloud_converter)",

@@ -33,6 +33,7 @@ OUSTER_PACKETS: Final = tuple(
 HESAI_PACKETS: Final = "hesai_ros_driver/msg/UdpFrame"
 PANDAR_PACKETS: Final = "pandar_msgs/msg/PandarScan"
 NEBULA_PACKETS: Final = "nebula_msgs/msg/NebulaPackets"
+HESAI: Final = (HESAI_PACKETS, PANDAR_PACKETS, NEBULA_PACKETS)
 ROBOSENSE_PACKET: Final = "rslidar_msg/msg/RslidarPacket"
 STRING: Final = "std_msgs/msg/String"
 BYTES: Final = "std_msgs/msg/UInt8MultiArray"

@@ -29,8 +29,9 @@ DESCRIBED: Final = b"beam_altitude_angles"
 """What metadata have in their text."""
 
 MISSING: Final = (
-    "the recording has packets of an Ouster, but no metadata: record the topic `metadata` beside that of the packets, "
-    "too, or give ?metadata=FILE (the JSON that ouster_ros or Ouster Studio saves)"
+    "there are packets of an Ouster, but no metadata: its driver publishes them on the topic `metadata` beside that of "
+    "the packets (record that, too; live, on another topic: lidar.metadata_topic), or give the JSON that ouster_ros or "
+    "Ouster Studio saves: ?metadata=FILE of a recording, lidar.metadata of the service"
 )
 
 MAX_BEAMS, MAX_COLUMNS, MAX_PACKET_COLUMNS = 256, 8192, 128
@@ -161,6 +162,11 @@ class OusterSensor:
         angles = np.radians(altitude_deg), np.radians(azimuth_deg)
         x_m, z_m = (1e-3 * value for value in origin_mm)
         return cls(profile, packet, columns, *angles, (x_m, z_m), T_sensor_lidar)
+
+    @property
+    def name(self) -> str:
+        """See `PacketSensor`."""
+        return f"Ouster with {len(self.altitude_rad)} beams ({self.profile})"
 
     @property
     def frame_id(self) -> str:

@@ -11,6 +11,7 @@ Source: the user manuals of these LiDARs, chapters "MSOP" and "DIFOP"; x is forw
 from __future__ import annotations
 
 import calendar
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -35,8 +36,8 @@ _RETURN_MODE_AT, _ELEVATIONS_AT, _ELEVATIONS_16_AT = 300, 468, 1165
 _BLOCK_ID: Final = 0xFFEE
 
 _NONE: Final = (
-    "the recording has packets of a RoboSense, but no DIFOP packet with the directions of its lasers: record those too "
-    "(rslidar_sdk sends both on one topic), or take the topic of PointCloud2"
+    "there are packets of a RoboSense, but no DIFOP packet with the directions of its lasers: record or publish those, "
+    "too (rslidar_sdk sends both on one topic), or take the topic of PointCloud2"
 )
 _OTHER: Final = (
     "packets of a RoboSense that is no RS-16, RS-32 or Helios of 32 lasers are not read: let rslidar_sdk convert them, "
@@ -207,6 +208,11 @@ class RobosenseSensor:
     pose: tuple[str, Matrix4] | None = None
     notes: tuple[Recognition, ...] = ()
 
+    @property
+    def name(self) -> str:
+        """See `PacketSensor`."""
+        return f"RoboSense {self.model.name}"
+
     def heads(self, glimpses: Sequence[bytes]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """See `PacketSensor`: a sweep begins where the driver says so, else where azimuths do."""
         seen = [_seen(one) for one in glimpses]
@@ -284,12 +290,12 @@ class RobosenseSensor:
             weights = 256 ** np.arange(5, -1, -1)
             micros = wide[:, 6:] @ 256 ** np.arange(3, -1, -1)
             return np.minimum(wide[:, :6] @ weights, 2**32) * 10**9 + micros * 1000  # type: ignore[no-any-return]
-        dates, which = np.unique(wide[:, :6], axis=0, return_inverse=True)
-        seconds = np.array([_seconds(*date) for date in dates.tolist()], np.int64)[which.ravel()]
+        seconds = np.array([_seconds(*date) for date in wide[:, :6].tolist()], np.int64)
         parts = wide[:, 6::2] * 256 + wide[:, 7::2]
         return seconds * 10**9 + parts[:, 0] * 10**6 + parts[:, 1] * 1000  # type: ignore[no-any-return]
 
 
+@functools.lru_cache
 def _seconds(year: int, month: int, day: int, hour: int, minute: int, second: int) -> int:
     if not (1 <= month <= 12 and 1 <= day <= 31 and hour < 24 and minute < 60 and second <= 60):
         return 0

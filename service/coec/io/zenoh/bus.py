@@ -13,7 +13,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
 from typing import Any, Protocol
@@ -22,9 +22,9 @@ import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from coec.calibration.types import Frame
-from coec.config import Config, LimitsConfig, StreamConfig, ZenohConfig
+from coec.config import Config, LimitsConfig, OpenLidarConfig, StreamConfig, ZenohConfig
 from coec.errors import CoecError, UnavailableError, UsageError
-from coec.io.ros import wire_format
+from coec.io.ros import messages, wire_format
 from coec.io.system import ServiceThread
 from coec.io.zenoh import session as zenoh_session
 from coec.schemas.message import to_json, to_msgpack
@@ -62,20 +62,42 @@ class StreamInput:
 
     Attributes:
         token: liveliness token that shows the subscription to others; None if none is needed.
+        described_on: key expressions of latched topics on which a LiDAR may say what it is. Their samples belong to the
+            stream, as messages of `std_msgs/msg/String`.
     """
 
     expressions: tuple[str, ...]
     read: Callable[[zenoh.Sample], InputSample]
     token: str | None = None
+    described_on: tuple[str, ...] = ()
+
+    def declared(self, session: zenoh.Session, receive: Callable[..., None]) -> list[Undeclarable]:
+        """Subscribers of the stream. `receive(sample, is_description=...)` is called on Zenoh's threads; the LiDAR says
+        what it is in a description."""
+        of_frames, of_descriptions = (direct(partial(receive, is_description=one)) for one in (False, True))
+        return [
+            *(_declare_latched(session, each, of_descriptions) for each in self.described_on),
+            *(session.declare_subscriber(each, of_frames) for each in self.expressions),
+        ]
+
+    def sample(self, sample: zenoh.Sample, is_description: bool) -> InputSample:
+        """The sample as the stream reads it."""
+        read = self.read(sample)
+        return replace(read, encoding=f"{CDR};{messages.STRING}") if is_description else read
 
 
 def input_of(stream: StreamConfig, config: Config) -> StreamInput:
     """The input of a stream of this configuration."""
     if stream.key is not None:
         return on_key(stream.key)
+    topics = stream.metadata_topics if isinstance(stream, OpenLidarConfig) else ()
     if config.middleware == "ros2dds":
-        return on_key(wire_format.topic_key(config.ros.namespace, stream.place))
-    return StreamInput(wire_format.topic_expressions(config.ros.domain, stream.place), _typed_by_key)
+        own, *others = (wire_format.topic_key(config.ros.namespace, topic) for topic in (stream.place, *topics))
+        return replace(on_key(own), described_on=tuple(others))
+    domain = config.ros.domain
+    described_on = tuple(each for topic in topics for each in wire_format.topic_expressions(domain, topic))
+    own_expressions = wire_format.topic_expressions(domain, stream.place)
+    return StreamInput(own_expressions, _typed_by_key, described_on=described_on)
 
 
 def on_key(key: str) -> StreamInput:
@@ -204,7 +226,7 @@ def closed(session: zenoh.Session, deadline_s: float) -> bool:
 _Waiting = queue.Queue[tuple[zenoh.Query, Sequence[Route], float]]
 
 
-class _Undeclarable(Protocol):
+class Undeclarable(Protocol):
     """A subscriber of any kind."""
 
     def undeclare(self) -> None: ...
@@ -216,7 +238,7 @@ class Bus:
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
-        self._subscribers: list[_Undeclarable] = []
+        self._subscribers: list[Undeclarable] = []
         self._queryables: list[zenoh.Queryable[None]] = []
         self._tokens: list[zenoh.LivelinessToken] = []
         self._waiting: dict[QueryLane, _Waiting] = {lane: queue.Queue(most) for lane, most in WAITING.items()}
@@ -236,7 +258,7 @@ class Bus:
         """Call `on_sample` for every put on the stream, on Zenoh's thread. Returns a function that ends this."""
         receive = self._receiver(stream, on_sample)
         token = self._shown(stream)
-        declared = [self._session.declare_subscriber(each, direct(receive)) for each in stream.expressions]
+        declared = stream.declared(self._session, receive)
         self._subscribers += declared
 
         def end() -> None:
@@ -254,17 +276,7 @@ class Bus:
         that transient local). Puts of this session itself are not heard."""
         receive = self._receiver(stream, on_sample)
         self._shown(stream)
-        for expression in stream.expressions:
-            subscriber = declare_advanced_subscriber(
-                self._session,
-                expression,
-                direct(receive),
-                allowed_origin=zenoh.Locality.REMOTE,
-                history=HistoryConfig(detect_late_publishers=True, max_samples=LATCHED_SAMPLES),
-                recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
-                subscriber_detection=True,
-            )
-            self._subscribers.append(subscriber)
+        self._subscribers += [_declare_latched(self._session, each, direct(receive)) for each in stream.expressions]
 
     def _shown(self, stream: StreamInput) -> zenoh.LivelinessToken | None:
         """Declares the liveliness token that shows others that this stream is subscribed; None if it has no token."""
@@ -275,11 +287,11 @@ class Bus:
         return token
 
     @staticmethod
-    def _receiver(stream: StreamInput, on_sample: Callable[[InputSample], None]) -> Callable[[zenoh.Sample], None]:
-        def receive(sample: zenoh.Sample) -> None:
+    def _receiver(stream: StreamInput, on_sample: Callable[[InputSample], None]) -> Callable[..., None]:
+        def receive(sample: zenoh.Sample, is_description: bool = False) -> None:
             try:
                 if sample.kind == zenoh.SampleKind.PUT:
-                    on_sample(stream.read(sample))
+                    on_sample(stream.sample(sample, is_description))
             except Exception:
                 _log.exception("a subscription failed", extra={"fields": {"key": stream.expressions[0]}})
 
@@ -397,6 +409,18 @@ def _answer_from(
             answer(query, routes, received_s)
         except zenoh.ZError:  # the client is gone
             _log.debug("a reply could not be delivered")
+
+
+def _declare_latched(session: zenoh.Session, expression: str, handler: zenoh.handlers.Callback[Any]) -> Undeclarable:
+    return declare_advanced_subscriber(
+        session,
+        expression,
+        handler,
+        allowed_origin=zenoh.Locality.REMOTE,
+        history=HistoryConfig(detect_late_publishers=True, max_samples=LATCHED_SAMPLES),
+        recovery=RecoveryConfig(periodic_queries=None, heartbeat=True),
+        subscriber_detection=True,
+    )
 
 
 def direct(callback: Callable[..., None]) -> zenoh.handlers.Callback[Any]:

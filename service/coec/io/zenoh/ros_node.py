@@ -302,8 +302,8 @@ class RosSide:
         return input_of(StreamConfig(topic=topic), self._config)
 
     def _announced(self, plain: StreamInput, topic: str | None, type_name: str, qos: Qos) -> StreamInput:
-        if self.node is None or topic is None:
-            return plain
+        if self.node is None or topic is None or type_name not in messages.known_types():
+            return plain  # a token needs the hash of the definition
         return replace(plain, token=self.node.dialect.subscriber_token(self.node.number(), topic, type_name, qos))
 
     def topics(self) -> RosTopicList:

@@ -17,6 +17,7 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -37,7 +38,8 @@ from coec.geometry.points import distinct_rings
 from coec.io import msgpack_frames
 from coec.io.frame_validation import Refusal
 from coec.io.logs import LossCounter
-from coec.io.ros import message_decoding, messages
+from coec.io.ros import message_decoding, messages, packet_streams
+from coec.io.ros.packet_streams import PacketAssembler, PacketSensor
 from coec.io.ros.transforms import MovingFrame
 from coec.io.ros.wire_format import MessageAttachment
 from coec.io.zenoh.bus import CDR, InputSample
@@ -330,10 +332,18 @@ class SampleReader:
         self._stream = stream
         self._limits = limits
         self._moving = MovingFrame(stream.parent, stream.child) if isinstance(stream, OpenEgoConfig) else None
+        self._packets: PacketAssembler | None = None
+        self._description: bytes | None = None
+        self._named: PacketSensor | None = None
+
+    @property
+    def packets(self) -> PacketAssembler | None:
+        """What makes sweeps of the packets of this stream; None: no packets have come."""
+        return self._packets
 
     def frame(self, sample: InputSample) -> Frame | None:
-        """The frame in a sample; None if it holds only transforms of other frames than the vehicle's, or the first
-        transforms.
+        """The frame in a sample, or the sweep that it ends; None if it ends none, or holds only transforms of other
+        frames than the vehicle's, or the first transforms, or says what the LiDAR is.
 
         Raises:
             DecodeError: the sample holds no frame, or one of another kind.
@@ -346,21 +356,54 @@ class SampleReader:
             encoding = f"application/{configured.encoding}"
         if encoding == CDR:
             type_name = schema or configured.assumed_type
+            if type_name in (messages.STRING, messages.BYTES) and self._kind == LIDAR:
+                self._describe(sample.payload)
+                return None
+            lidar = configured if isinstance(configured, OpenLidarConfig) else None
+            if lidar is not None and not schema and lidar.type is None and lidar.has_packets:
+                raise DecodeError(WRONG_TYPE, f"{lidar.place}: messages name no type: set lidar.type")
             if type_name not in configured.types:
                 expected = " or ".join(configured.types)
                 refusal = message_decoding.REFUSED.get(type_name, "a message of another type")
                 raise DecodeError(WRONG_TYPE, f"{configured.place}: expected {expected}; {refusal}")
+            if type_name in packet_streams.TYPES and lidar is not None:
+                return self._sweep(type_name, sample, lidar.metadata)
             if type_name == messages.TF and self._moving is not None:
                 return self._moving.motion(sample.payload)
-            time, source = None, None
-            if isinstance(configured, OpenLidarConfig):
-                time, source = configured.time, configured.source
+            time, source = (None, None) if lidar is None else (lidar.time, lidar.source)
             return message_decoding.decode(type_name, sample.payload, self._limits, point_time=time, source=source)
         if self._kind == CAMERA:
             return msgpack_frames.decode_camera(sample.payload, self._limits)
         if self._kind == LIDAR:
             return msgpack_frames.decode_lidar(sample.payload, self._limits)
         return msgpack_frames.decode_ego(sample.payload, self._limits)
+
+    def _describe(self, text: bytes) -> None:
+        if packet_streams.is_description(text) and len(text) <= packet_streams.MAX_DESCRIPTION_BYTES:
+            self._description = text
+            if self._packets is not None:
+                self._packets.describe(text)
+
+    def _sweep(self, type_name: str, sample: InputSample, metadata: Path | None) -> LidarFrame | None:
+        if self._packets is None or self._packets.type_name != type_name:
+            if metadata is not None:
+                try:
+                    with metadata.open("rb") as file:
+                        self._description = file.read(packet_streams.MAX_DESCRIPTION_BYTES)
+                except OSError as error:
+                    text = f"cannot read lidar.metadata: {error.strerror}"
+                    raise DecodeError(Refusal.MESSAGE_TYPE, text) from error
+            self._packets = PacketAssembler(type_name, self._description)
+        sent = MessageAttachment.parse(sample.attachment)
+        frame = self._packets.add(sample.payload, time.time_ns() if sent is None else sent.source_ns)
+        sensor = self._packets.sensor
+        if frame is not None and sensor is not None and sensor is not self._named:
+            self._named = sensor
+            fields = {"sensor": self._stream.sensor}
+            _log.info(f"packets of the LiDAR: {sensor.name}", extra={"fields": fields})
+            for note in self._packets.notes:
+                _log.log(logging.WARNING if note.level == "warn" else logging.INFO, note.text, extra={"fields": fields})
+        return frame
 
 
 class Decoder:
@@ -423,8 +466,8 @@ class Decoder:
             self._overruns.append(UNNAMED_SENDER)
 
     def frame(self, sample: InputSample) -> Frame | None:
-        """The frame in a sample. None if it was refused (and counted), or holds only transforms of other frames than
-        the vehicle's. Never raises, whatever a sender sent."""
+        """The frame in a sample, or the sweep that it ends. None if it was refused (and counted), or gives none (see
+        `SampleReader.frame`). Never raises, whatever a sender sent."""
         self._received += 1
         while self._overruns:
             self._senders.counted(self._overruns.popleft())
@@ -624,6 +667,9 @@ FRAMES_WAITING = 16
 MOTIONS_WAITING = 512
 """Ego-motion samples that may wait: 2.5 s at 200 Hz."""
 
+PACKETS_WAITING = 4096
+"""Messages of a LiDAR's packets that may wait: 2.5 s at 1,600 Hz, within the limit of bytes."""
+
 READ_WITHOUT = frozenset({"name", "mask", "hardware_id", "info_topic", "sweep", "T_lidar_ego"})
 """Settings that do not change how the samples of a stream are read. Streams that differ only in these are one."""
 
@@ -662,6 +708,8 @@ class SensorStream:
     @property
     def depth(self) -> int:
         """How many samples may wait."""
+        if isinstance(self.config, LidarConfig) and self.config.has_packets:
+            return PACKETS_WAITING
         return MOTIONS_WAITING if self.kind == EGO else FRAMES_WAITING
 
     def take(self, sample: InputSample, now_s: float) -> list[Frame]:

@@ -1,8 +1,8 @@
-"""Packets of a LiDAR on a topic of a bag, and the sweeps that they make up.
+"""Packets of a LiDAR on a topic, and the sweeps that they make up: of a bag (`PacketStream`), or as they come
+(`PacketAssembler`). Both group them by the number of the turn in each.
 
 The index of a bag keeps the beginning of each packet. What a packet means is known only after the whole bag was read,
-because what the sensor says of itself (its metadata) may come late. Then packets are grouped to sweeps by the number of
-the turn in each.
+because what the sensor says of itself (its metadata) may come late.
 
 A sensor that is not synchronised counts from its own start. Its times are moved to the clock of the recorder: a packet
 comes late by as much as network and driver need, never before its end, so that the one that came soonest within some
@@ -12,6 +12,7 @@ seconds ties the two clocks; over longer times, clocks of oscillators drift apar
 from __future__ import annotations
 
 from array import array
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Protocol
@@ -30,6 +31,9 @@ MAX_DESCRIPTION_BYTES: Final = 2**20
 MAX_PACKETS: Final = 8192
 """Most messages of a sweep: as many as a turn may have columns."""
 
+MAX_SWEEP_BYTES: Final = ouster_packets.MAX_SWEEP_BYTES
+"""Most bytes of the messages of a sweep that is not complete."""
+
 NEIGHBOURS: Final = 100
 """Sweeps before and after a sweep by which its clock is tied to the recorder's: 10 s each at 10 Hz."""
 
@@ -46,6 +50,10 @@ started or ended within them."""
 
 class PacketSensor(Protocol):
     """A sensor whose packets are read; see `ouster_packets.OusterSensor`."""
+
+    @property
+    def name(self) -> str:
+        """Maker and model, for people."""
 
     @property
     def frame_id(self) -> str:
@@ -83,7 +91,7 @@ class PacketFormat(Protocol):
 
 FORMATS: Final[Mapping[str, PacketFormat]] = {
     **dict.fromkeys(messages.OUSTER_PACKETS, ouster_packets),
-    **dict.fromkeys((messages.HESAI_PACKETS, messages.PANDAR_PACKETS, messages.NEBULA_PACKETS), hesai_packets),
+    **dict.fromkeys(messages.HESAI, hesai_packets),
     messages.ROBOSENSE_PACKET: robosense_packets,
 }
 """By the type of the messages that are read."""
@@ -190,7 +198,9 @@ class PacketStream:
         logged_ns = np.frombuffer(self.logged_ns, np.int64)[[group[len(group) // 2] for group in groups]]
         stamps_ns, notes = middles_ns, sensor.notes
         if np.median(middles_ns) < SET_S * 1e9:
-            stamps_ns = middles_ns + _ahead_ns(np.array([self._lag_ns(group, times_ns[group]) for group in groups]))
+            received_ns = np.frombuffer(self.logged_ns, np.int64)
+            lags_ns = [_lag_ns(received_ns[group], times_ns[group]) for group in groups]
+            stamps_ns = middles_ns + _ahead_ns(np.array(lags_ns))
             notes = (*notes, _FREE_RUNNING)
         other = int((numbers == -1).sum())
         if other or self.damaged:
@@ -206,18 +216,12 @@ class PacketStream:
         ]
         return sweeps, notes
 
-    def _lag_ns(self, group: NDArray[np.int64], times_ns: NDArray[np.int64]) -> int:
-        """Least time from the end of a message of a sweep until it was received. One of which only the first time is
-        known lasts until the next one."""
-        lasts_ns = int(np.median(times_ns[1:, 0] - times_ns[:-1, 1])) if len(times_ns) > 1 else 0
-        return int((np.frombuffer(self.logged_ns, np.int64)[group] - times_ns[:, 1]).min()) - lasts_ns
-
 
 _FREE_RUNNING: Final = Recognition(
     "lidar_clock",
-    "The LiDAR's clock counts from its start. Its sweeps are stamped by the times at which the recorder got their "
-    "packets, so that they may be late by the least delay of network and driver: synchronise it (PTP), or say "
-    "?lidar_offset=S.",
+    "The LiDAR's clock counts from its start. Its sweeps are stamped by the times at which their packets were "
+    "received, so that they may be late by the least delay of network and driver: synchronise it (PTP), or say "
+    "?lidar_offset=S of a recording.",
     "warn",
 )
 
@@ -240,6 +244,13 @@ def _grouped(numbers: NDArray[np.int64]) -> list[list[int]]:
     return groups
 
 
+def _lag_ns(received_ns: NDArray[np.int64], times_ns: NDArray[np.int64]) -> int:
+    """Least time from the end of a message of a sweep until it was received: of (N,) times of receipt, and (N, 2) of
+    the sensor. One of which only the first time is known lasts until the next one."""
+    lasts_ns = int(np.median(times_ns[1:, 0] - times_ns[:-1, 1])) if len(times_ns) > 1 else 0
+    return int((received_ns - times_ns[:, 1]).min()) - lasts_ns
+
+
 def _middle(times_ns: NDArray[np.int64]) -> int:
     """Between the first and the last time; columns that were not measured may have none."""
     known_ns = times_ns[times_ns > 0]
@@ -254,3 +265,104 @@ def _ahead_ns(lags_ns: NDArray[np.int64]) -> NDArray[np.int64]:
             same_start = np.abs(lags_ns[near] - lags_ns[at]) < RESTART_NS
             np.minimum(ahead_ns[at], lags_ns[near], out=ahead_ns[at], where=same_start)
     return ahead_ns
+
+
+# --- live -------------------------------------------------------------------------------------------------------------
+
+OVERTAKEN: Final = 8
+"""A sweep ends once the next one has this part of its messages: until then, one that was overtaken may come."""
+
+
+@dataclass(slots=True)
+class _OpenSweep:
+    """The messages of a sweep so far, and when each was received."""
+
+    number: int
+    messages: list[bytes] = field(default_factory=list)
+    glimpses: list[bytes] = field(default_factory=list)
+    received_ns: list[int] = field(default_factory=list)
+    bytes: int = 0
+
+
+class PacketAssembler:
+    """Sweeps from messages of packets as they come. The first one is left out, because it may have begun earlier.
+
+    Attributes:
+        sensor: the sensor that sends; None until that is known.
+    """
+
+    def __init__(self, type_name: str, description: bytes | None = None) -> None:
+        """`description`: what the sensor says of itself, if that is known."""
+        self.type_name = type_name
+        self.sensor: PacketSensor | None = None
+        self._format = FORMATS[type_name]
+        self._description = description
+        self._open: deque[_OpenSweep] = deque()
+        self._number, self._last = 0, b""
+        self._is_first = True
+        self._lags_ns: deque[int] = deque(maxlen=NEIGHBOURS)
+
+    @property
+    def notes(self) -> tuple[Recognition, ...]:
+        """What is to be said of the points."""
+        notes = () if self.sensor is None else self.sensor.notes
+        return (*notes, _FREE_RUNNING) if self._lags_ns else notes
+
+    def describe(self, text: bytes) -> None:
+        """A message came in which a sensor says what it is. One that differs from the last begins anew."""
+        if self._format.DESCRIBED in text and text != self._description:
+            self._description, self.sensor, self._is_first = text, None, True
+            self._open.clear()
+
+    def add(self, message: bytes, received_ns: int) -> LidarFrame | None:
+        """A message came. The sweep that it ends, if it ends one.
+
+        Raises:
+            DecodeError: `message_type`: nothing says what the sensor is, or it is not read; or the message, or the
+                sweep that it ends, cannot be used.
+        """
+        glimpse = self._format.glimpse(message)
+        if self.sensor is None and self._format.DESCRIBED in message:
+            self.describe(message)
+            return None
+        if self.sensor is None:
+            self.sensor = self._format.sensor_of([glimpse], self._description)
+        before = [self._open[-1].glimpses[0], self._last] if self._open else []
+        _, numbers = self.sensor.heads([*before, glimpse])
+        if numbers[-1] == -1:
+            raise DecodeError(Refusal.MESSAGE_MALFORMED, "packets in another form than those of points")
+        if numbers[-1] < 0:
+            return None
+        # Some numbers count from the first message of a list, so that only differences mean something.
+        number = self._number + int(numbers[-1] - numbers[-2]) if before else 0
+        self._number, self._last = number, glimpse
+        sweep = next((one for one in self._open if one.number == number), None)
+        if sweep is None:
+            sweep = _OpenSweep(number)
+            self._open.append(sweep)
+        if len(sweep.messages) == MAX_PACKETS or sweep.bytes + len(message) > MAX_SWEEP_BYTES:
+            text = f"a sweep has at most {MAX_PACKETS} messages of packets with {MAX_SWEEP_BYTES} bytes"
+            raise DecodeError(Refusal.CLOUD_TOO_LARGE, text)
+        sweep.messages.append(message)
+        sweep.glimpses.append(glimpse)
+        sweep.received_ns.append(received_ns)
+        sweep.bytes += len(message)
+        oldest, newest = self._open[0], self._open[-1]
+        is_over = len(self._open) > 1 and OVERTAKEN * len(newest.messages) >= len(oldest.messages)
+        return self._finished(self.sensor) if is_over or len(self._open) > 2 else None
+
+    def _finished(self, sensor: PacketSensor) -> LidarFrame | None:
+        """The oldest sweep."""
+        sweep, is_first = self._open.popleft(), self._is_first
+        self._is_first = False
+        if is_first:
+            return None
+        times_ns, _ = sensor.heads(sweep.glimpses)
+        stamp_ns = middle_ns = _middle(times_ns)
+        if middle_ns < SET_S * 1e9:
+            lag_ns = _lag_ns(np.array(sweep.received_ns), times_ns)
+            if self._lags_ns and abs(lag_ns - self._lags_ns[-1]) > RESTART_NS:
+                self._lags_ns.clear()
+            self._lags_ns.append(lag_ns)
+            stamp_ns = middle_ns + min(self._lags_ns)
+        return sensor.sweep(sweep.messages, middle_ns, stamp_ns)
