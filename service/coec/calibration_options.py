@@ -76,7 +76,7 @@ class SolverOptions(TypedDict, total=False):
     camera_model: Annotated[str | None, Flag(metavar="NAME", suggestions=lambda: ("double_sphere",))]
     """Fit this model to the camera and use it: double_sphere. Refused if it does not fit the lens."""
 
-    frames: Annotated[int | None, Flag(shown="25", minimum=1)]
+    frames: Annotated[int | None, Flag(shown="25", metavar="N", minimum=1)]
     """Use at most this many camera frames, evenly spaced."""
 
     motion_compensation: Annotated[
@@ -98,7 +98,7 @@ class CalibrationOptions(SolverOptions, total=False):
     """Keyword arguments of `coec.calibrate`, together with those of `SolverOptions`. What is not given is as recorded,
     else the default."""
 
-    perturb: Annotated[str | Sequence[float] | None, Flag(typed=str, metavar="RX,RY,RZ[,TX,TY,TZ]")]
+    perturb: Annotated[str | Sequence[float] | None, Flag(typed=str, metavar="RX,RY,RZ[,TX,...]")]
     """Move the start away from the recording's calibration: degrees about the camera axes, then metres along them."""
 
     start: Annotated[Literal["recording", "none"] | None, Flag(shown="recording")]

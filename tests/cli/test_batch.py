@@ -29,6 +29,7 @@ def test_a_batch_makes_tables_compares_with_the_vehicles_and_goes_on(
     assert (document["windows"], document["kept"], document["compared"], document["differing"]) == (2, 0, 1, 0)
     assert document["errors"] == {"bad_window": 1}
     assert "2 of 2" not in first.out
+    assert "bad.mcap is damaged" in first.err, "why the first window of each kind of error has no result"
 
     refused = coec("batch", recorded, "--output", folder)
     assert refused.status == 2

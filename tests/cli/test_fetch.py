@@ -1,4 +1,4 @@
-"""`coec fetch`: a red event of a vehicle that had one, over a router; and of vehicles that say what they like."""
+"""`coec fetch`: an incident of a vehicle that had one, over a router; and of vehicles that say what they like."""
 
 from __future__ import annotations
 

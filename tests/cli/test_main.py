@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from importlib.metadata import entry_points
@@ -30,6 +31,14 @@ def test_help_lists_every_command(coec: Coec) -> None:
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help(coec: Coec, command: str) -> None:
     assert coec(command, "--help").status == 0
+
+
+@pytest.mark.parametrize("command", (*BUILT_IN, "evaluate", "resample", "demo", "bench"))
+def test_no_name_of_an_option_is_cut_off_on_a_terminal_of_80_columns(
+    coec: Coec, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert re.findall(r"--[\w-]+…", coec(command, "--help").out) == []
 
 
 def test_help_of_all_commands_imports_nothing_heavy() -> None:
@@ -86,6 +95,7 @@ def test_usage_error_with_json_is_a_document_too(coec: Coec) -> None:
     outcome = coec("calibrate", "--no-such-option", "--json")
     assert outcome.status == 2
     assert outcome.document["error"]["code"] == "bad_request"
+    assert "--no-such-option" in outcome.document["error"]["message"]
 
 
 def test_deliberate_error_is_a_line_without_traceback(coec: Coec) -> None:
@@ -93,6 +103,8 @@ def test_deliberate_error_is_a_line_without_traceback(coec: Coec) -> None:
     assert outcome.status == 1
     assert outcome.err.startswith("coec: /no/such/recording does not exist")
     assert "Traceback" not in outcome.err
+    assert "accepted forms" not in outcome.err, "a path that is absent is meant as a path"
+    assert "accepted forms" in coec("calibrate", "recording").err
 
 
 def test_deliberate_error_with_json(coec: Coec) -> None:

@@ -274,5 +274,5 @@ def test_overlays_differ_where_the_poses_do(right: package.Result) -> None:
 
 @pytest.mark.parametrize("perturb", [(1.0,), (1.0, 2.0, float("nan")), ()])
 def test_a_perturbation_that_is_none_is_refused(drive: package.Recording, perturb: tuple[float, ...]) -> None:
-    with pytest.raises(UsageError, match="give three numbers"):
+    with pytest.raises(UsageError, match="give three finite numbers"):
         drive.calibrate(depth="stereo", perturb=perturb)

@@ -200,7 +200,7 @@ def test_the_list_reports_what_a_window_is_retained_for_and_names_snippets(coec:
     outcome = coec("query", "windows", "--connect", vehicle)
     assert "vehicle/front  1 window, 1 snippet" in outcome.out
     (window,) = (line for line in outcome.out.splitlines() if "front-1" in line)
-    assert "red event" in window
+    assert "incident" in window
     (snippet,) = (line for line in outcome.out.splitlines() if "front-7.snippet" in line)
     assert "suspect" in snippet
 

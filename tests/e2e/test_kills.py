@@ -34,7 +34,7 @@ from support.fake_worker import wait_until
 pytest.importorskip("embreex", reason="needs embreex")
 
 SPEED = 16.0
-"""Seconds of driving per second. Whenever the drive begins again the mount is back where it was: a red event twice in
+"""Seconds of driving per second. Whenever the drive begins again the mount is back where it was: an incident twice in
 each pass."""
 
 LONGEST_S = 5.0
@@ -154,7 +154,7 @@ def _check_windows(before: list[Any], now: dict[str, Any], folder: Path) -> None
 
 @pytest.fixture
 def config(tmp_path: Path, router: Router) -> Path:
-    """Short windows, and snippets of red events, so that there is always something to be written."""
+    """Short windows, and snippets of incidents, so that there is always something to be written."""
     path = write_configuration(
         tmp_path,
         rendered(EARLY_STEPPED).recording,

@@ -368,7 +368,7 @@ def test_closure_as_text(coec: Coec) -> None:
         (("evaluate", "--rotation-deg", "1"), "give a SOURCE, or --closure A B"),
         (("evaluate", SMALL, "--closure", SMALL, SMALL, "--rotation-deg", "1"), "not both"),
         (("evaluate", SMALL, "--relative", "0,0,0", "--rotation-deg", "1"), "it needs --closure A B"),
-        ((*CLOSURE, "--relative", "1,2"), "--relative 1,2: give three numbers"),
+        ((*CLOSURE, "--relative", "1,2"), "--relative 1,2: give three finite numbers"),
         ((*CLOSURE, "--nees", "2"), "an experiment of its own"),
     ],
 )

@@ -1,4 +1,4 @@
-"""The page of a red event: it tells what the documents say, and obeys none of them."""
+"""The page of an incident: it tells what the documents say, and obeys none of them."""
 
 from __future__ import annotations
 

@@ -80,13 +80,17 @@ def batch(
     ] = None,
     rig: Annotated[Path | None, typer.Option(help="Evaluate with this rig (JSON).", metavar="FILE")] = None,
     depth: DepthModel = None,
-    jobs: Annotated[int | None, typer.Option(help="Number of windows at a time.", min=1, show_default="the cores")] = (
-        None
-    ),
+    jobs: Annotated[
+        int | None, typer.Option(help="Number of windows at a time.", metavar="N", min=1, show_default="the cores")
+    ] = (None),
     resume: Annotated[bool, typer.Option("--resume", help="Continue the batch that is in the folder.")] = False,
     keep_going: KeepGoing = False,
-    deadline_s: Annotated[float, typer.Option("--deadline", help="Time limit for one window, s.", min=1.0)] = 600.0,
-    memory_mib: Annotated[int, typer.Option("--memory", help="Memory limit for one process, MiB.", min=256)] = 2048,
+    deadline_s: Annotated[
+        float, typer.Option("--deadline", help="Time limit for one window, s.", metavar="SECONDS", min=1.0)
+    ] = 600.0,
+    memory_mib: Annotated[
+        int, typer.Option("--memory", help="Memory limit for one process, MiB.", metavar="MIB", min=256)
+    ] = 2048,
     as_json: Json = False,
 ) -> int:
     """Evaluate many windows again: exit 0 if every one has a result, 1 if not."""
@@ -128,7 +132,8 @@ def _engine(
 
 @contextmanager
 def _progress(total: int) -> Iterator[Callable[[WindowRow], None]]:
-    """A function to call with every row; it shows a bar with rate and remaining time, or prints a line now and then."""
+    """A function to call with every row; it shows a bar with rate and remaining time, or prints a line now and then, and
+    says why the first window of each kind of error has no result."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
     bars = Progress(
@@ -145,10 +150,14 @@ def _progress(total: int) -> Iterator[Callable[[WindowRow], None]]:
     )
     task = bars.add_task("windows", total=total, note="")
     done, errors, began_s, printed_s = 0, 0, time.monotonic(), time.monotonic()
+    seen: set[str] = set()
 
     def on_row(row: WindowRow) -> None:
         nonlocal done, errors, printed_s
         done, errors = done + 1, errors + (row.error is not None)
+        if row.error_code is not None and row.error_code not in seen:
+            seen.add(row.error_code)
+            console.say(row.error if row.error and row.url in row.error else f"{row.url}: {row.error}")
         now_s = time.monotonic()
         note = f"{done / max(now_s - began_s, 1e-9):.2f}/s, {errors} without a result"
         bars.update(task, advance=1, note=note)

@@ -1,4 +1,4 @@
-"""`coec fetch`: fetches what a vehicle stores of a red event, over whatever link there is, and makes a page of it.
+"""`coec fetch`: fetches what a vehicle stores of an incident, over whatever link there is, and makes a page of it.
 
 Nothing that a vehicle sends is trusted: names become file names only where they are valid names, sizes are bounded, and
 what a document says about itself is compared with what was requested.
@@ -70,7 +70,7 @@ def fetch(
         str | None,
         typer.Argument(
             metavar="EVENT",
-            help="Id of a red event, or `latest`; without it, the vehicle's red events are listed.",
+            help="Id of an incident, or `latest`; without it, the vehicle's incidents are listed.",
             show_default=False,
         ),
     ] = None,
@@ -91,7 +91,7 @@ def fetch(
     ] = 120.0,
     as_json: Json = False,
 ) -> int:
-    """Fetch a red event into one folder: pictures, recordings, history, and a report page.
+    """Fetch an incident into one folder: pictures, recordings, history, and a report page.
 
     The same command resumes an interrupted download.
     """
@@ -177,7 +177,7 @@ def _list(events: Sequence[EvidenceEvent], vehicle: str, *, as_json: bool) -> in
         ours = tuple(event for event in events if event.pair == pair)
         replies.evidence(to_json(EvidenceReply(vehicle=vehicle, pair=pair, events=ours)))
     if not events:
-        console.show(f"{vehicle} has no red event")
+        console.show(f"{vehicle} has no incident")
     return 0
 
 

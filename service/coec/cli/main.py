@@ -202,7 +202,8 @@ def main() -> int:
             if as_json:
                 _print_error("interrupted", "ended by Ctrl-C before there was a result")
         if status == ExitCode.USAGE and as_json:
-            _print_error("bad_request", "the command line does not fit; standard error says how")
+            say = getattr(end.__context__, "format_message", None)
+            _print_error("bad_request", say() if say else "the command line does not fit; standard error says how")
         return status
     except CoecError as error:
         formatting.write(f"coec: {error}\n", on_error=True)

@@ -38,7 +38,7 @@ PATIENCE_S = 60.0
 """How long to wait for a window of which no piece arrives; what has arrived is kept for the next attempt."""
 
 OF_PAIR = re.compile(r"(?P<pair>[A-Za-z0-9_.-]{1,64})-\d{1,19}(\.snippet)?", re.ASCII)
-"""Names of windows, snippets and red events: their pair, and a time in nanoseconds."""
+"""Names of windows, snippets and incidents: their pair, and a time in nanoseconds."""
 
 PICTURE_KEYS = ("overlay", "evidence")
 """Keys whose answer may be a picture, for `--output`."""
@@ -60,7 +60,7 @@ KEYS = (
     Key("windows", "recorded windows and snippets"),
     Key("windows/ID", "one of them, into --output FILE, its sha256 verified"),
     Key("overlay", "picture of the latest window, into --output FILE.jpg", "at=nominal, window=ID"),
-    Key("evidence", "stored red events"),
+    Key("evidence", "stored incidents"),
     Key("evidence/ID", "one of them; a picture of it with --output FILE.jpg", "overlay=before, overlay=after"),
     Key("rig", "all sensors of the vehicle together"),
     Key("status", "the service itself: streams, worker, budget, problems"),
@@ -257,7 +257,7 @@ def _keys(request: Request, address: ServiceAddress) -> Keys:
 
 
 def _pair_of(session: zenoh.Session, request: Request, keys: Keys, named: str) -> str:
-    """The pair of a window or a red event: the given one, else the one in its name, else the vehicle's only one."""
+    """The pair of a window or an incident: the given one, else the one in its name, else the vehicle's only one."""
     if request.pair is not None:
         return request.pair
     match = OF_PAIR.fullmatch(named)

@@ -56,7 +56,7 @@ class StateConfig(ConfigModel):
     max_protected_bytes: int = Field(
         default=2 * 2**30,
         ge=0,
-        description="windows of red events and commissionings, which are kept longer than the others; beyond this the "
+        description="windows of incidents and commissionings, which are kept longer than the others; beyond this the "
         "oldest of them count as ordinary windows",
     )
     packing: Literal["lz4", "none"] = Field(
@@ -66,7 +66,7 @@ class StateConfig(ConfigModel):
         default=500, ge=1, le=10_000, description="results, states and commands kept per pair, of each kind"
     )
     checks: int = Field(default=2000, ge=1, le=100_000, description="checks of the monitor kept per pair, 2 kB each")
-    evidence: int = Field(default=8, ge=1, le=100, description="red events kept per pair, with their windows")
+    evidence: int = Field(default=8, ge=1, le=100, description="incidents kept per pair, with their windows")
 
 
 class SnippetsConfig(ConfigModel):
@@ -303,6 +303,6 @@ class UplinkConfig(ConfigModel):
     evidence_bytes_per_s: int = Field(
         default=1_000_000,
         ge=1_000,
-        description="long-run limit for history, red events, pictures and bytes of windows; beyond it the service asks "
+        description="long-run limit for history, incidents, pictures and bytes of windows; beyond it the service asks "
         "the reader to wait",
     )

@@ -78,7 +78,7 @@ def detail(pair: PairNow) -> RenderableType:
         cells = [console.figure(value, sign=sign) for value, sign in zip(values, signed, strict=True)]
         figures.add_row(f"{title} [{console.UNITS[axis]}]", *cells)
     served = f"served: {word.provenance or 'nothing yet'}, {console.attempt(word.status)}"
-    event = f", newest red event {console.plain(word.event)}" if word.event else ""
+    event = f", newest incident {console.plain(word.event)}" if word.event else ""
     return Group(*lines, Text(served + event), figures)
 
 

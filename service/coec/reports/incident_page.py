@@ -1,4 +1,4 @@
-"""The page of a red event: what happened, what was seen, what was decided and why. Whatever a vehicle says is shown as
+"""The page of an incident: what happened, what was seen, what was decided and why. Whatever a vehicle says is shown as
 text, never as markup."""
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -53,7 +53,7 @@ SAW = "What the camera saw: at the calibration that was served, and at the true 
 def page(incident: FetchedIncident, pictures: Mapping[str, bytes], made: Provenance) -> Page:
     """The page; `pictures` are the files beside it, by name."""
     event = incident.event
-    codes = ", ".join(reason.code for reason in event.reasons) or "red event"
+    codes = ", ".join(reason.code for reason in event.reasons) or "incident"
     results = () if incident.history is None else incident.history.results
     entries = () if incident.history is None else incident.history.entries
     sections = [

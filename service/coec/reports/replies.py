@@ -250,7 +250,8 @@ def windows(payload: bytes) -> None:
         verdict = console.styled(window.decision or ("not evaluated" if window.sha256 else "not read yet"))
         pairs = "?" if window.pairs is None else str(window.pairs)
         row = (window.window_id, pairs, size, verdict, (window.sha256 or "not read yet")[:16])
-        table.add_row(*row, *([(window.kept_for or "").replace("_", " ")] if retention_column else []))
+        kept_for = "incident" if window.kept_for == "red_event" else window.kept_for or ""
+        table.add_row(*row, *([kept_for] if retention_column else []))
     console.out.print(table)
     if reply.snippets:
         table = console.table("snippet", "MB", "event", "sha256", right=(1,))
@@ -262,7 +263,7 @@ def windows(payload: bytes) -> None:
 def evidence(payload: bytes) -> None:
     """Red events of a pair."""
     reply = from_json(replies.EvidenceReply, payload)
-    console.show(f"{reply.vehicle}/{reply.pair}  {count(len(reply.events), 'red event')}")
+    console.show(f"{reply.vehicle}/{reply.pair}  {count(len(reply.events), 'incident')}")
     table = console.table("event", "began", "why", "window before", "window after", "now")
     for event in reply.events:
         why = "; ".join(reason.code for reason in event.reasons)
@@ -272,7 +273,7 @@ def evidence(payload: bytes) -> None:
 
 
 def event(payload: bytes) -> None:
-    """One red event."""
+    """One incident."""
     reply = from_json(replies.EvidenceEvent, payload)
     console.show(f"{reply.event_id}  began {second(reply.wall_ns)}, {reply.resolution or 'still red'}")
     for reason in reply.reasons:

@@ -120,11 +120,11 @@ class Keys:
         return f"{self.root}/{pair}/overlay"
 
     def evidence(self, pair: str) -> str:
-        """Queryable: list of the kept red events."""
+        """Queryable: list of the kept incidents."""
         return f"{self.root}/{pair}/evidence"
 
     def evidence_of(self, pair: str, event_id: str) -> str:
-        """Queryable: one red event with its figures, or a picture of it (`?overlay=before`, `?overlay=after`)."""
+        """Queryable: one incident with its figures, or a picture of it (`?overlay=before`, `?overlay=after`)."""
         return f"{self.root}/{pair}/evidence/{event_id}"
 
     def command(self, pair: str, name: str) -> str:

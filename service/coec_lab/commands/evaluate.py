@@ -29,7 +29,7 @@ Relative = Annotated[
     typer.Option(
         help="With --closure: pose of sensor A in the frame of B, degrees and metres. Default: from the "
         "calibrations of both recordings.",
-        metavar="RX,RY,RZ,TX,TY,TZ",
+        metavar="RX,...,TZ",
     ),
 ]
 RadiusMetres = Annotated[float, typer.Option(help="Radius of the sphere of starts, metres.", metavar="T", min=0)]

@@ -70,7 +70,7 @@ READABLE = {
     "a window": KEYS.window(PAIR, "front-1"),
     "overlay": KEYS.overlay(PAIR),
     "evidence": KEYS.evidence(PAIR),
-    "a red event": KEYS.evidence_of(PAIR, "front-1"),
+    "an incident": KEYS.evidence_of(PAIR, "front-1"),
     "status": KEYS.status,
     "metrics": KEYS.metrics,
     "config": KEYS.config,

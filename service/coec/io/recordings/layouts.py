@@ -58,7 +58,8 @@ def open_source(spec: str) -> RecordingSource:
 
 def _open_path(spec: SourceSpec) -> RecordingSource:
     if not spec.path.exists():
-        raise SourceError(f"{spec.path} does not exist", FORMS)
+        is_name = len(spec.path.parts) == 1 and not spec.path.suffix  # it may be meant as another form
+        raise SourceError(f"{spec.path} does not exist", *([FORMS] if is_name else []))
     if is_bag(spec):
         from coec.io.recordings.bag import open_bag
 

@@ -138,7 +138,7 @@ def perturbation_vector(what: str, values: Sequence[float]) -> NDArray[np.float6
         UsageError: these are not three or six finite numbers, or larger than any mount has; begins with `what`.
     """
     if len(values) not in (3, 6) or not np.isfinite(values).all():
-        raise UsageError(f"{what}: give three numbers (degrees), or six (degrees, then metres)")
+        raise UsageError(f"{what}: give three finite numbers (degrees), or six (degrees, then metres)")
     xi = np.zeros(6)
     xi[: len(values)] = values
     if np.abs(xi[:3]).max() > HALF_TURN_DEG or np.abs(xi[3:]).max() > FARTHEST_M:

@@ -350,7 +350,8 @@ def is_later(timestamp: zenoh.Timestamp | None, before: zenoh.Timestamp | None) 
 
 def too_late(selector: str, timeout_s: float) -> RemoteError:
     """The error for a query that somebody received but did not answer in time."""
-    return RemoteError("timeout", f"no answer to {selector} within {timeout_s:g} s: the service is too busy")
+    text = f"no answer to {selector} within {timeout_s:g} s: the service is too busy; try again, or wait longer"
+    return RemoteError("timeout", f"{text} (--timeout SECONDS, timeout_s)")
 
 
 def myself() -> bytes:

@@ -257,7 +257,7 @@ class PairAnswers:
 
     @property
     def newest_event(self) -> str | None:
-        """Id of the newest red event that is kept; None if there is none."""
+        """Id of the newest incident that is kept; None if there is none."""
         newest = self._store.incidents.newest
         return None if newest is None else newest.event_id
 
@@ -334,12 +334,12 @@ class PairAnswers:
         return self._folder.read(self.name, window_id, offset, length)
 
     def events(self) -> replies.EvidenceReply:
-        """The red events that are kept, without their figures."""
+        """The incidents that are kept, without their figures."""
         bare = tuple(event.model_copy(update={"metrics": ()}) for event in self._store.publishable_records().events)
         return replies.EvidenceReply(vehicle=self._vehicle, pair=self.name, events=bare)
 
     def event(self, event_id: str) -> replies.EvidenceEvent:
-        """One red event with its figures.
+        """One incident with its figures.
 
         Raises:
             NotFoundError: no such event.

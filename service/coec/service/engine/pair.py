@@ -461,7 +461,7 @@ class Pair:
         epoch: int | None = None,
         by_check: bool = False,
     ) -> messages.SelectionChange | None:
-        """Changes the state, and has the picture of a red event rendered. Returns what that changes in the selection;
+        """Changes the state, and has the picture of an incident rendered. Returns what that changes in the selection;
         None if the step was meant for another extrinsic."""
         taken = self.store.update(step, stamp_ns, completed=completed, epoch=epoch)
         if taken is None:
@@ -486,7 +486,7 @@ class Pair:
     # --- evidence ---------------------------------------------------------------------------------------------------
 
     def _add_window_after(self, result: CalibrationResult) -> None:
-        """Adds a result to the evidence of a red event if it is the first window that began after the event began. The
+        """Adds a result to the evidence of an incident if it is the first window that began after the event began. The
         windows before and after it are rendered, each at the served extrinsic and at the one of this result: the first
         fits the images before the event, the second those after it."""
         waiting, since_ns = self.store.incidents.awaiting, self.store.state.flagged_since_ns
@@ -498,7 +498,7 @@ class Pair:
             self._render_both_sides(event, matrix_of(result.camera_from_lidar), result.verdict.decision)
 
     def _render_beginning(self, event: EvidenceEvent, state: PairState) -> None:
-        """A red event has begun. If a window has caused it, that is the window after it; else nothing but the window
+        """An incident has begun. If a window has caused it, that is the window after it; else nothing but the window
         before it is known, which is rendered at the served extrinsic."""
         latest = state.latest
         if latest is not None and event.window_after == latest.window_id:

@@ -1,4 +1,4 @@
-"""The evidence of every red event: the windows before and after it, pictures, the figures around it, the decision.
+"""The evidence of every incident: the windows before and after it, pictures, the figures around it, the decision.
 
 Each event has a folder with `event.json` and the pictures. The windows themselves stay in the window folder, where they
 are protected from removal. If there are too many events, the oldest is dropped, and its windows lose that protection.
@@ -81,7 +81,7 @@ class Incidents:
                 self._keep(newest.model_copy(update={"metrics": (*newest.metrics, point)}))
 
     def begin(self, event: EvidenceEvent) -> EvidenceEvent:
-        """A red event begins; the figures so far are added to it."""
+        """An incident begins; the figures so far are added to it."""
         with self._lock:
             opened = event.model_copy(update={"metrics": tuple(self._points)})
             self._after = POINTS_AFTER
