@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coec.calibration.lens import estimate_lens
 from coec.calibration.uncertainty.displaced_edges import LENS, SIZE
 from coec.calibration.uncertainty.posterior import LENS_OFF, NOMINAL, Hypothesis, Posterior
+from coec.calibration.verdict import estimate_lens
 from coec.geometry.cameras import build
 
 CAMERA = build("pinhole", width=600, height=800, fx=400.0, fy=500.0, cx=300.0, cy=400.0)

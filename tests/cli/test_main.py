@@ -33,7 +33,7 @@ def test_every_command_has_help(coec: Coec, command: str) -> None:
     assert coec(command, "--help").status == 0
 
 
-@pytest.mark.parametrize("command", (*BUILT_IN, "evaluate", "resample", "demo", "bench"))
+@pytest.mark.parametrize("command", [*BUILT_IN, "evaluate", "resample", "demo", "bench"])
 def test_no_name_of_an_option_is_cut_off_on_a_terminal_of_80_columns(
     coec: Coec, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:

@@ -28,9 +28,8 @@ from coec.calibration.types import (
 )
 from coec.io.serialise import result_of
 from coec.reports import fleet_page, incident_page
-from coec.reports.baseline_page import baselines_page
 from coec.reports.calibration import calibration_page
-from coec.reports.diagnosis import check_page
+from coec.reports.diagnosis import baselines_page, check_page
 from coec.reports.incident_page import FetchedIncident
 from coec.reports.page import Compare, Page, Pictures
 from coec.reports.page_parts import Provenance, file_picture

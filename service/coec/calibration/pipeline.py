@@ -6,7 +6,6 @@ import numpy as np
 
 from coec.calibration import verdict
 from coec.calibration.frames.motion_compensation import compensation
-from coec.calibration.lens import estimate_lens
 from coec.calibration.search.change_point import change_point, moved_within
 from coec.calibration.solver import EstimatorResult, WindowData, prepare_window_data, solve
 from coec.calibration.types import (
@@ -88,6 +87,6 @@ def estimate_of(result: EstimatorResult, data: WindowData, config: CalibrationCo
             config.objective, config.search, config.verdict, str(config.motion_compensation), data.depth.identity
         ),
         moved=moved,
-        lens=estimate_lens(optimum.posterior, window.rig.camera),
+        lens=verdict.estimate_lens(optimum.posterior, window.rig.camera),
         cues=result.cues,
     )

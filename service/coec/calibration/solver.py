@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.frames.ego_mask import MIN_FRAMES, MIN_SPEED_MPS, lit_pixels
+from coec.calibration.frames.evidence import stands
 from coec.calibration.frames.motion_compensation import EVERY, Choice, compensate
-from coec.calibration.frames.sweep_evidence import stands
 from coec.calibration.objective import mutual_information
 from coec.calibration.objective.edges import EdgeCue, build_edges, independent_samples_at
 from coec.calibration.objective.fused import FusedObjective, Fusion, Scale

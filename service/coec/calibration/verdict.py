@@ -4,12 +4,12 @@ of the rig.
     failed if MI < MI_lim or f' > f'_lim or f'' < f''_lim
 
 Each figure compares the window with itself. So one set of limits serves any scene, network and number of bins until a
-rig is commissioned.
+rig is commissioned. `estimate_lens` reports what the window shows of the lens.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from math import degrees, inf, isfinite, isnan, radians, sqrt
+from math import degrees, hypot, inf, isfinite, isnan, radians, sqrt
 from types import MappingProxyType
 
 import numpy as np
@@ -26,6 +26,7 @@ from coec.calibration.types import (
     MOVED,
     Decision,
     FramePair,
+    LensEstimate,
     Metric,
     MovedWithin,
     Reason,
@@ -37,6 +38,7 @@ from coec.calibration.uncertainty import posterior
 from coec.calibration.uncertainty.covariance import AssessedOptimum
 from coec.config import CalibrationConfig, VerdictConfig
 from coec.geometry import se3
+from coec.geometry.cameras import Camera
 
 ROTATION, TRANSLATION = slice(0, 3), slice(3, 6)
 """Places of rotation and translation in ξ = [rx ry rz tx ty tz]."""
@@ -302,3 +304,34 @@ def judge(
         text = f"{count}: take a window while the vehicle drives past other objects"
         reasons.append(Reason("motion", text))
     return Verdict(Decision.FAILED if reasons else Decision.ACCEPTED, metrics, tuple(reasons))
+
+
+DETERMINED = 1.0 / 3.0
+"""A window determines what it knows to this share of the prior of a free lens: the prior then displaces it by no more
+than a tenth."""
+
+
+def estimate_lens(distribution: posterior.Posterior | None, camera: Camera) -> LensEstimate | None:
+    """What the posterior of a window says of focal length, principal point and first radial term of a camera; None
+    without a posterior.
+
+    Each hypothesis has a lens of its own. The estimate is the mean of this mixture, so it stays with the intrinsics of
+    the rig, within what is known of them, unless the window contradicts them. What the window says alone is the lens of
+    the hypothesis whose lens is free.
+    """
+    free = None if distribution is None else distribution.of(posterior.LENS_OFF)
+    if distribution is None or free is None:
+        return None
+    weights = np.array([one.probability for one in distribution.hypotheses])
+    lenses = np.array([one.lens for one in distribution.hypotheses])
+    variances = np.array([one.lens_sigma for one in distribution.hypotheses]) ** 2
+    mean = np.einsum("h,hi->i", weights, lenses)
+    spread = np.sqrt(np.einsum("h,hi->i", weights, variances + (lenses - mean) ** 2))
+    unit = np.array([camera.fx, camera.fy, 1.0, 0.5 * hypot(camera.width, camera.height)])
+    values = np.stack([mean, spread, free.lens, free.lens_sigma]) * unit
+    if not np.isfinite(values).all():
+        return None
+    determined = free.lens_sigma <= DETERMINED * np.array(posterior.LENS_WRONG)
+    difference, sigma, free_difference, free_sigma = values
+    other = distribution.probability(*posterior.OF_LENS)
+    return LensEstimate(difference, sigma, free_difference, free_sigma, determined, other)

@@ -132,8 +132,8 @@ def _engine(
 
 @contextmanager
 def _progress(total: int) -> Iterator[Callable[[WindowRow], None]]:
-    """A function to call with every row; it shows a bar with rate and remaining time, or prints a line now and then, and
-    says why the first window of each kind of error has no result."""
+    """A function to call with every row; it shows a bar with rate and remaining time, or prints a line now and then.
+    It says why the first window of each kind of error has no result."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
     bars = Progress(

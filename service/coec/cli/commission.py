@@ -63,7 +63,7 @@ def commission(
     from coec.io.rig_files import load_baselines, save_baseline
     from coec.io.user_files import try_file
     from coec.reports import page
-    from coec.reports.baseline_page import baselines_page
+    from coec.reports.diagnosis import baselines_page
     from coec.reports.page_parts import Provenance
 
     serials = _serials_of(sensors or ())

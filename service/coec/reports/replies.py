@@ -250,8 +250,8 @@ def windows(payload: bytes) -> None:
         verdict = console.styled(window.decision or ("not evaluated" if window.sha256 else "not read yet"))
         pairs = "?" if window.pairs is None else str(window.pairs)
         row = (window.window_id, pairs, size, verdict, (window.sha256 or "not read yet")[:16])
-        kept_for = "incident" if window.kept_for == "red_event" else window.kept_for or ""
-        table.add_row(*row, *([kept_for] if retention_column else []))
+        retention = "incident" if window.kept_for == "red_event" else window.kept_for or ""
+        table.add_row(*row, *([retention] if retention_column else []))
     console.out.print(table)
     if reply.snippets:
         table = console.table("snippet", "MB", "event", "sha256", right=(1,))

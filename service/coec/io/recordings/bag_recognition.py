@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError, model_validator
 
-from coec.calibration.frames import motion_evidence, sweep_evidence
+from coec.calibration.frames import evidence
 from coec.calibration.frames.pairing import motion_at
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Recognition, Rig
 from coec.config import CameraIntrinsics, FilePath, Matrix4x4, describe
@@ -67,7 +67,7 @@ class Readings:
 
     Attributes:
         rings: whether ring numbers are scan lines.
-        compensated: the instant for which points were compensated, see `sweep_evidence`; empty: for none.
+        compensated: the instant for which points were compensated, see `calibration.frames.evidence`; empty: for none.
         clouds: how many clouds make a sweep.
         motion: `twist` or `pose`: from what of an odometry the motion comes.
         camera_offset_ns, lidar_offset_ns: added to the stamps.
@@ -90,9 +90,7 @@ class Readings:
         return cls(
             _value(query, "rings", {"lines": True, "none": False}),
             _value(query, "compensated", {"no": "", **{name: name for name in ("stamp", "begin", "middle", "end")}}),
-            _value(
-                query, "clouds_per_sweep", {str(count): count for count in range(1, sweep_evidence.MOST_CLOUDS + 1)}
-            ),
+            _value(query, "clouds_per_sweep", {str(count): count for count in range(1, evidence.MOST_CLOUDS + 1)}),
             _value(query, "motion", {"twist": "twist", "pose": "pose"}),
             _offset_ns(query, "camera_offset"),
             _offset_ns(query, "lidar_offset"),
@@ -108,7 +106,7 @@ def _value(query: dict[str, str], key: str, values: dict[str, Value]) -> Value |
         return None
     if query[key] not in values:
         names = list(values)
-        accepted = ", ".join(names) if len(names) < sweep_evidence.MOST_CLOUDS else f"{names[0]} to {names[-1]}"
+        accepted = ", ".join(names) if len(names) < evidence.MOST_CLOUDS else f"{names[0]} to {names[-1]}"
         raise UsageError(f"{key}={query[key]}: it is one of {accepted}")
     return values[query[key]]
 
@@ -137,10 +135,10 @@ def motion_of_odometry(
     if motion == "pose":
         return _by_poses(reader, places), None
     sampled = [_posed(reader, places[index]) for index in _near_each_other(places)]
-    reading = motion_evidence.reading_of_twists(sampled)
-    if reading is motion_evidence.TwistReading.AS_STATED:
+    reading = evidence.reading_of_twists(sampled)
+    if reading is evidence.TwistReading.AS_STATED:
         return None, None
-    if reading is motion_evidence.TwistReading.CONTRADICTED:
+    if reading is evidence.TwistReading.CONTRADICTED:
         text = (
             "The velocities of the odometry do not fit its poses; the velocities are used. If the poses are right, say "
             "?motion=pose; ?motion=twist leaves out this line."
@@ -155,7 +153,7 @@ def motion_of_odometry(
 
 def _by_poses(reader: BagReader, places: Sequence[MessageLocation]) -> tuple[EgoMotion, ...]:
     """The motion by the poses, without jumps that no vehicle makes."""
-    motions = motion_evidence.motions_of_poses([_posed(reader, place) for place in places])
+    motions = evidence.motions_of_poses([_posed(reader, place) for place in places])
     return tuple(
         motion for motion in motions if max(map(abs, (*(motion.linear_mps or ()), *motion.angular_radps))) <= MAX_SPEED
     )
@@ -167,15 +165,15 @@ def _near_each_other(places: Sequence[MessageLocation]) -> list[int]:
     for start in evenly_spread(len(places), SAMPLED_MOVES):
         for index in range(start, min(start + MOST_BETWEEN, len(places))):
             selected.add(index)
-            if places[index].stamp_ns - places[start].stamp_ns >= motion_evidence.LEAST_S * 1e9:
+            if places[index].stamp_ns - places[start].stamp_ns >= evidence.LEAST_S * 1e9:
                 break
     return sorted(selected)
 
 
-def _posed(reader: BagReader, place: MessageLocation) -> motion_evidence.PoseAndTwist:
+def _posed(reader: BagReader, place: MessageLocation) -> evidence.PoseAndTwist:
     payload = reader.read(place.at)
     try:
-        return motion_evidence.PoseAndTwist(odometry_pose(payload), message_decoding.odometry(payload))
+        return evidence.PoseAndTwist(odometry_pose(payload), message_decoding.odometry(payload))
     except DecodeError as error:
         raise SourceError(f"the {messages.ODOMETRY} of {place.stamp_ns} ns: {error}") from error
 
@@ -209,17 +207,13 @@ def sweeps_of_clouds(
         )
         return alone, (Recognition("several_lidars", text, "warn"),)
     # A LiDAR that does not turn shows the same sectors at once.
-    if (
-        not seen
-        or sweep_evidence.sectors(seen[0]).sum() >= sweep_evidence.WHOLE * sweep_evidence.SECTORS
-        or not _turning(seen)
-    ):
+    if not seen or evidence.sectors(seen[0]).sum() >= evidence.WHOLE * evidence.SECTORS or not _turning(seen):
         return alone, ()
-    seen += [load(place) for place in places[len(seen) : sweep_evidence.MOST_CLOUDS]]
-    in_turn = sweep_evidence.clouds_in_turn([sweep_evidence.sectors(one) for one in seen])
+    seen += [load(place) for place in places[len(seen) : evidence.MOST_CLOUDS]]
+    in_turn = evidence.clouds_in_turn([evidence.sectors(one) for one in seen])
     if in_turn == 1:
         return alone, ()
-    degrees = 360 * float(np.median([sweep_evidence.sectors(one).sum() for one in seen])) / sweep_evidence.SECTORS
+    degrees = 360 * float(np.median([evidence.sectors(one).sum() for one in seen])) / evidence.SECTORS
     what = f"Each cloud covers {degrees:.0f} degrees of the turn, {in_turn} in a row the whole"
     if in_turn == 2 and seen[0].time_offset_s is None:
         text = (
@@ -248,8 +242,8 @@ def _overlap(clouds: Sequence[LidarFrame]) -> bool:
 
 def _turning(seen: Sequence[LidarFrame]) -> bool:
     """Whether clouds look into different directions."""
-    covered = [sweep_evidence.sectors(one) for one in seen]
-    return bool(np.any(covered, axis=0).sum() > sweep_evidence.SAME * np.median([one.sum() for one in covered]))
+    covered = [evidence.sectors(one) for one in seen]
+    return bool(np.any(covered, axis=0).sum() > evidence.SAME * np.median([one.sum() for one in covered]))
 
 
 def _joined(places: Sequence[MessageLocation], count: int) -> list[Sweep]:
@@ -301,13 +295,13 @@ def compensated(
     sweeps: Iterable[LidarFrame], motions: Sequence[EgoMotion], T_lidar_ego: Matrix4, override: str = "?compensated=no"
 ) -> tuple[str | None, Recognition | None]:
     """The instant for which the points of these sweeps were compensated before they were recorded, as a name in
-    `sweep_evidence.instants_s`, None: for none; and what to tell."""
+    `evidence.instants_s`, None: for none; and what to tell."""
     moving = []
     for sweep in sweeps:
         motion = motion_at(motions, sweep.stamp_ns, MOTION_REACH_NS // 5)
-        if motion is not None and motion.reaches(sweep_evidence.LEAST_SPEED_MPS):
+        if motion is not None and motion.reaches(evidence.LEAST_SPEED_MPS):
             moving.append((sweep, motion))
-    instant = sweep_evidence.compensated_for(moving, T_lidar_ego)
+    instant = evidence.compensated_for(moving, T_lidar_ego)
     if instant is None:
         return None, None
     text = (
@@ -319,7 +313,7 @@ def compensated(
 
 def as_compensated(sweep: LidarFrame, instant: str) -> LidarFrame:
     """The sweep, all its points at the instant for which they were compensated."""
-    at_s = sweep_evidence.instants_s(sweep).get(instant)
+    at_s = evidence.instants_s(sweep).get(instant)
     if at_s is None:
         return sweep
     return replace(sweep, time_offset_s=np.full(len(sweep.xyz_m), at_s, np.float32))

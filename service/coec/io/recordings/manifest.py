@@ -24,7 +24,7 @@ from ruamel.yaml.nodes import CollectionNode, MappingNode, Node
 
 from coec import config
 from coec.calibration import types
-from coec.calibration.frames import sweep_evidence
+from coec.calibration.frames import evidence
 from coec.calibration.frames.lidar_origin import ApparentOrigin, SeveralOrigins
 from coec.calibration.search.mistakes import INVERSE_POSE
 from coec.config.model import ConfigModel
@@ -192,7 +192,7 @@ def _read(path: Path) -> tuple[ManifestDocument, Camera, NDArray[np.bool_] | Non
 
 def _compensated(recording: recording_source.FramewiseRecording) -> tuple[str | None, types.Recognition | None]:
     """See `bag_recognition.compensated`, of some sweeps at which the vehicle is known to drive."""
-    driving = {m.stamp_ns for m in recording.motions if m.reaches(sweep_evidence.LEAST_SPEED_MPS)}
+    driving = {m.stamp_ns for m in recording.motions if m.reaches(evidence.LEAST_SPEED_MPS)}
     moving = [frame for frame in recording.frames if frame.camera_stamp_ns in driving]
     sampled = [moving[index] for index in recording_source.evenly_spread(len(moving), bag_recognition.SAMPLED_SWEEPS)]
     sweeps = (frame.load_lidar() for frame in sampled)
