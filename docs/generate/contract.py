@@ -88,7 +88,7 @@ RESOURCES: Mapping[str, _Resource] = {
     "overlay": _Resource("JPEG", grammar.parse_overlay_selector),
     "evidence": _Resource(_model(replies.EvidenceReply), grammar.parse_selector),
     "evidence_of": _Resource(f"{_model(replies.EvidenceEvent)}, or a JPEG", grammar.parse_evidence_selector),
-    "command": _Resource(_model(replies.Acknowledgement), grammar.parse_command_selector),
+    "command": _Resource(_model(commands.Acknowledgement), grammar.parse_command_selector),
     "alive": _Resource("liveliness token"),
     "claims": _Resource("liveliness tokens; each answered, without content, by its daemon"),
 }

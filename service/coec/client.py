@@ -37,10 +37,10 @@ from coec.io.zenoh.bus import MSGPACK
 from coec.io.zenoh.command_auth import CommandSender
 from coec.io.zenoh.session import connected_of, credentials_in, read_settings
 from coec.io.zenoh.subscriptions import PairUpdate, subscribed
-from coec.schemas.commands import COMMAND_NAMES, CommandName
+from coec.schemas.commands import COMMAND_NAMES, Acknowledgement, CommandName
 from coec.schemas.keys import Keys
 from coec.schemas.message import from_msgpack
-from coec.schemas.replies import Acknowledgement, ExtrinsicReply, HealthReply, HistoryReply, StatusReply, WindowsReply
+from coec.schemas.replies import ExtrinsicReply, HealthReply, HistoryReply, StatusReply, WindowsReply
 
 __all__ = ["PairUpdate", "Vehicle"]
 

@@ -23,10 +23,10 @@ from coec.io.zenoh.query_client import Reply, connected
 from coec.reports import console, fleet_board, replies
 from coec.schemas import documents as fleet_now
 from coec.schemas import heartbeat, message, rig_state
+from coec.schemas.commands import Acknowledgement
 from coec.schemas.documents import Finding
 from coec.schemas.keys import Keys
 from coec.schemas.replies import (
-    Acknowledgement,
     ErrorReply,
     EvidenceEvent,
     EvidenceReply,

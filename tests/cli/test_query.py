@@ -19,11 +19,10 @@ from coec.cli.query import PLAIN_KEYS, WITH_ARGUMENT, query
 from coec.config import LimitsConfig, ZenohConfig
 from coec.errors import NotFoundError
 from coec.io.zenoh.bus import JSON, Answer, Bus, QueryLane, Request, Route, open_session
-from coec.schemas.commands import COMMAND_NAMES, arguments_of
+from coec.schemas.commands import COMMAND_NAMES, Acknowledgement, arguments_of
 from coec.schemas.keys import RIG, Keys, parse_command_selector, parse_range_selector
 from coec.schemas.message import Message, to_json
 from coec.schemas.replies import (
-    Acknowledgement,
     PairStatus,
     SnippetInfo,
     WindowInfo,

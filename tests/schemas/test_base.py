@@ -13,8 +13,9 @@ from pydantic import BaseModel
 
 from coec import schemas
 from coec.errors import DecodeError
+from coec.schemas.commands import Acknowledgement
 from coec.schemas.message import from_json, from_msgpack, json_value, to_json, to_msgpack
-from coec.schemas.replies import Acknowledgement, HealthReply, MetricReply, StreamStatus, Transform
+from coec.schemas.replies import HealthReply, MetricReply, StreamStatus, Transform
 from coec.untrusted import Untrusted
 from support.strategies import HOSTILE, hostile_message, message_texts, obeyed_characters
 

@@ -18,9 +18,10 @@ from coec.errors import NotFoundError
 from coec.io.disk_writer import DiskWriter
 from coec.io.system import ServiceThread
 from coec.io.zenoh.ros_node import RosTopicList
+from coec.schemas.commands import Acknowledgement
 from coec.schemas.keys import Keys
 from coec.schemas.message import to_json
-from coec.schemas.replies import Acknowledgement, HistoryEntry
+from coec.schemas.replies import HistoryEntry
 from coec.schemas.rig_state import RigReply
 from coec.service import camera_lidar_pair as runtime_pair
 from coec.service.api.command_execution import RigCommands

@@ -51,8 +51,9 @@ from coec.io.zenoh.bus import Bus, open_session
 from coec.io.zenoh.command_auth import CommandListener, credentials_of
 from coec.io.zenoh.ros_node import RosTopicList
 from coec.io.zenoh.session import Reach, settings_of
+from coec.schemas.commands import Acknowledgement
 from coec.schemas.keys import Keys
-from coec.schemas.replies import Acknowledgement, HistoryEntry
+from coec.schemas.replies import HistoryEntry
 from coec.service import camera_lidar_pair as runtime_pair
 from coec.service.api.authorization import Authority, CommandHandler, CommandRules
 from coec.service.api.reply_builders import SerializedReply

@@ -392,8 +392,8 @@ def _render(reply: Reply, kind: str | None) -> None:
 
 
 def _succeeded(reply: Reply, kind: str | None) -> bool:
+    from coec.schemas.commands import Acknowledgement
     from coec.schemas.message import from_json
-    from coec.schemas.replies import Acknowledgement
 
     return kind != "command" or from_json(Acknowledgement, reply.payload).accepted
 

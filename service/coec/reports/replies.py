@@ -13,6 +13,7 @@ from rich.text import Text
 from coec.reports import console, lens_report
 from coec.reports.formatting import count, hold_text, second
 from coec.schemas import replies, rig_state
+from coec.schemas.commands import Acknowledgement
 from coec.schemas.message import from_json
 
 NAMED = 3
@@ -363,7 +364,7 @@ def _joint(joint: rig_state.JointReply) -> None:
 
 def command(payload: bytes) -> None:
     """The answer to a command."""
-    reply = from_json(replies.Acknowledgement, payload)
+    reply = from_json(Acknowledgement, payload)
     outcome = Text("accepted", "bold green") if reply.accepted else Text("not accepted", "bold yellow")
     window = f" (window {reply.window_id})" if reply.window_id else ""
     console.out.print(f"{reply.vehicle}/{reply.pair} {reply.command}: ", outcome, sep="")

@@ -1,4 +1,4 @@
-"""Commands on the wire: their names, their arguments, and the form of a command whose sender proves its name."""
+"""Commands on the wire: names and arguments, the form of a command whose sender proves its name, and the answer."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from typing import Final, Literal, get_args
 
 from pydantic import Field
 
-from coec.schemas.message import Message
+from coec.schemas.message import Message, Text
 
 CommandName = Literal["calibrate", "apply", "rollback", "reset", "commission", "hold"]
 """Commands of CONTRACT."""
@@ -65,3 +65,20 @@ class ProvenCommand(Message):
         "another pair or command"
     )
     payload: str = Field(default="", description="arguments of the command, a JSON object; empty: none")
+
+
+class Acknowledgement(Message):
+    """The answer to a command that was understood: whether it is carried out."""
+
+    vehicle: Text
+    pair: Text
+    command: Text
+    accepted: bool
+    code: Text = Field(description="machine-readable outcome")
+    text: Text = Field(description="one sentence")
+    window_id: Text | None = Field(default=None, description="the window it acts on")
+    durable: bool | None = Field(
+        default=None,
+        description="whether the effect is on the disk, safe from a power cut; false: not yet, and `health` says what "
+        "is wrong with the disk; null if nothing was done",
+    )

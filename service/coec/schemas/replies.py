@@ -689,23 +689,6 @@ class StatusReply(Message):
     queries_waiting: Counts = Field(default_factory=dict, description="queries that wait for an answer, by queue")
 
 
-class Acknowledgement(Message):
-    """The answer to a command that was understood: whether it is carried out."""
-
-    vehicle: Text
-    pair: Text
-    command: Text
-    accepted: bool
-    code: Text = Field(description="machine-readable outcome")
-    text: Text = Field(description="one sentence")
-    window_id: Text | None = Field(default=None, description="the window it acts on")
-    durable: bool | None = Field(
-        default=None,
-        description="whether the effect is on the disk, safe from a power cut; false: not yet, and `health` says what "
-        "is wrong with the disk; null if nothing was done",
-    )
-
-
 class ErrorReply(Message):
     """Payload of an error reply."""
 

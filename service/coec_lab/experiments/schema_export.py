@@ -29,7 +29,7 @@ MESSAGES: tuple[type[Message], ...] = (
     replies.EvidenceEvent,
     replies.WindowsReply,
     replies.StatusReply,
-    replies.Acknowledgement,
+    commands.Acknowledgement,
     replies.ErrorReply,
     replies.CalibrationResult,
     replies.CalibrationReport,

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from coec.errors import SourceError
 from coec.io import user_files
-from coec.io.recordings.cloud_files import CloudLayout, Table, TableError, load_cloud, parse_pcd, parse_ply
+from coec.io.recordings.cloud_files import CloudLayout, load_cloud
+from coec.io.recordings.cloud_formats import Table, TableError, parse_pcd, parse_ply
 
 NAN = float("nan")
 POINTS = [(1.5, -2.0, 3.25, 10.0, 3), (NAN, 0.0, 0.0, 20.0, 4), (4.0, 5.0, -6.0, 30.5, 5)]

@@ -18,7 +18,8 @@ from ruamel.yaml.scanner import Scanner
 from coec.config import MAX_YAML_BYTES, load_config, load_yaml, parse_yaml
 from coec.errors import CoecError, ConfigError, SourceError
 from coec.io import user_files
-from coec.io.recordings.cloud_files import MAX_TABLE_BYTES, MAX_UNPACKED_BYTES, TableError, load_cloud, parse_pcd
+from coec.io.recordings.cloud_files import load_cloud
+from coec.io.recordings.cloud_formats import MAX_TABLE_BYTES, MAX_UNPACKED_BYTES, TableError, parse_pcd
 from coec.io.recordings.kitti import read_numbers, read_stamps
 from coec.io.recordings.layouts import open_source
 from support.recordings import npy, npy_with_header, npz, pcd
@@ -146,7 +147,7 @@ def test_much_of_a_small_compressed_file_stays_within_its_bound() -> None:
 
 
 def test_text_rows_are_read_in_blocks_with_the_right_place_of_a_complaint(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("coec.io.recordings.cloud_files.ASCII_BLOCK_BYTES", 20)
+    monkeypatch.setattr("coec.io.recordings.cloud_formats.ASCII_BLOCK_BYTES", 20)
     rows = [f"{i} {i} {i}" for i in range(50)]
     head = pcd(*XYZ, 50, "ascii")
     assert parse_pcd(head + "\n".join(rows).encode())["z"].tolist() == list(range(50))

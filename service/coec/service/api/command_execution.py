@@ -17,9 +17,8 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from coec.errors import CoecError, NotFoundError
-from coec.schemas.commands import CANDIDATE, COMMAND_NAMES, REASON
+from coec.schemas.commands import CANDIDATE, COMMAND_NAMES, REASON, Acknowledgement
 from coec.schemas.keys import RIG
-from coec.schemas.replies import Acknowledgement
 from coec.schemas.rig_state import RigReply
 from coec.service.api.pair_answers import PendingPairCommands
 from coec.service.engine.commands import EXPIRED, PairCommand

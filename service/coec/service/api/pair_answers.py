@@ -24,7 +24,7 @@ from coec.io.ros.messages import CAMERA_INFO
 from coec.io.serialise import reasons_of, result_of
 from coec.io.zenoh.bus import Answer
 from coec.schemas import replies
-from coec.schemas.commands import COMMAND_NAMES
+from coec.schemas.commands import COMMAND_NAMES, Acknowledgement
 from coec.schemas.keys import Format
 from coec.service.api import problems, reply_builders
 from coec.service.discovery import info_topic_of
@@ -508,13 +508,11 @@ class PendingPairCommands:
         with self._lock:
             return dict(self._counts)
 
-    def carry_out(
-        self, name: str, arguments: dict[str, Any], sender: str, deadline_s: float = 0.0
-    ) -> replies.Acknowledgement:
+    def carry_out(self, name: str, arguments: dict[str, Any], sender: str, deadline_s: float = 0.0) -> Acknowledgement:
         """Refuses the command, and says why."""
         del arguments, sender, deadline_s
         self._count(f"{name}_refused")
-        return replies.Acknowledgement(
+        return Acknowledgement(
             vehicle=self._vehicle,
             pair=self._pair,
             command=name,

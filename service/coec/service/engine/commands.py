@@ -13,7 +13,8 @@ from coec.calibration.types import Rig
 from coec.config import PairConfig
 from coec.errors import NotFoundError
 from coec.io.serialise import candidate_of, estimate_of, matrix_of
-from coec.schemas.replies import Acknowledgement, Candidate
+from coec.schemas.commands import Acknowledgement
+from coec.schemas.replies import Candidate
 from coec.service.engine.messages import Action, CommissioningSubject, SubmitCommissioning, SubmitSolve, WindowSubject
 from coec.service.engine.pair import Pair
 from coec.service.ingest.inbox import BusyError
