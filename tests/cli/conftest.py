@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -44,7 +45,9 @@ Coec = Callable[..., Outcome]
 
 @pytest.fixture
 def coec(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Coec:
-    """Runs `coec ARGS`."""
+    """Runs `coec ARGS`, without the lines that say how far a command is, which only a slow machine prints."""
+    monkeypatch.setattr("coec.reports.console.LINE_S", math.inf)
+    monkeypatch.setattr("coec.reports.console.COMPILING_S", math.inf)
 
     def run(*arguments: object) -> Outcome:
         monkeypatch.setattr(sys, "argv", ["coec", *(str(argument) for argument in arguments)])

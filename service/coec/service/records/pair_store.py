@@ -38,8 +38,8 @@ MIN_HASH = 8
 """At least so many characters of a hash name a line of the history."""
 
 DEFAULT_TEXTS = {
-    HealthState.HEALTHY: "The served extrinsic was checked and agrees with the data.",
-    HealthState.UNKNOWN: "The served extrinsic was not checked yet.",
+    HealthState.HEALTHY: "What is served has been looked at and agrees with the data.",
+    HealthState.UNKNOWN: "What is served has not been looked at.",
 }
 """Text for a state of health that comes without reasons."""
 
