@@ -22,7 +22,8 @@ TWIST = np.array([0.0, 0.01, 0.25, 7.0, 0.3, 0.0])
 MS = 1_000_000
 
 
-READINGS = tuple(reading for reading in TwistReading if reading not in (TwistReading.DEGREES, TwistReading.NO_TURN))
+OF_TURNS = (TwistReading.DEGREES, TwistReading.NO_TURN, TwistReading.OTHER_SIGN)
+READINGS = tuple(reading for reading in TwistReading if reading not in OF_TURNS)
 
 
 def stated(reading: TwistReading, pose: Matrix4, velocity_mps: Vector) -> Vector:
@@ -70,6 +71,7 @@ def test_what_was_written_is_recognised(reading: TwistReading, period_ms: int, n
         (0.0, TwistReading.NO_TURN),
         (1.1, TwistReading.AS_STATED),
         (0.5, TwistReading.AS_STATED),
+        (-1.0, TwistReading.OTHER_SIGN),
     ],
 )
 def test_turn_rates_are_recognised_where_velocities_are_right(factor: float, reading: TwistReading) -> None:
@@ -78,6 +80,19 @@ def test_turn_rates_are_recognised_where_velocities_are_right(factor: float, rea
         for one in drive()
     ]
     assert reading_of_twists(turned) is reading
+
+
+@pytest.mark.parametrize(
+    ("factor", "reading"), [(57.3, TwistReading.DEGREES), (1.0, TwistReading.AS_STATED), (5.0, TwistReading.AS_STATED)]
+)
+def test_turn_rates_in_degrees_are_recognised_where_the_vehicle_hardly_turns(
+    factor: float, reading: TwistReading
+) -> None:
+    pose, messages = np.eye(4), []
+    for k in range(200):
+        messages.append(PoseAndTwist(pose, EgoMotion(k * 20 * MS, "base", (7.0, 0.0, 0.0), (0.0, 0.0, 0.02 * factor))))
+        pose = pose @ se3.exp(np.array([0.0, 0.0, 0.02, 7.0, 0.0, 0.0]) * 0.02)
+    assert reading_of_twists(messages) is reading
 
 
 @pytest.mark.parametrize("wrong", [0.9, 1.1])

@@ -132,6 +132,39 @@ def test_clouds_without_a_stamp_are_read_by_the_times_of_their_points(tmp_path: 
     assert np.abs(late_ns).max() < 1000  # neighbouring doubles are 0.2 us apart
 
 
+def test_clouds_without_a_point_are_left_out_and_counted(tmp_path: Path) -> None:
+    drive = drive_messages()
+    places = [place for place, (topic, _) in enumerate(drive) if topic == "/points"]
+    for place in places[:2]:
+        empty = ros.sensor_msgs__msg__PointCloud2(
+            drive[place][1].header, 1, 0, [], False, 16, 0, np.zeros(0, np.uint8), True
+        )
+        drive[place] = ("/points", empty)
+    recording: Any = open_source(str(Bag(drive).write(tmp_path / "b.mcap")))
+    assert len(recording.sweep_stamps_ns) == len(places) - 2
+    (note,) = (one for one in recording.recognitions if one.code == "clouds_empty")
+    assert note.text == "2 of the clouds on /points have no point, and are left out."
+    alone = [(topic, empty if topic == "/points" else message) for topic, message in drive]
+    with pytest.raises(SourceError, match="/points has clouds without a point"):
+        open_source(str(Bag(alone).write(tmp_path / "empty.mcap")))
+
+
+@pytest.mark.parametrize("cameras", [1, 2, 3])
+def test_several_cameras_on_one_topic_are_recognised_by_their_images(tmp_path: Path, cameras: int) -> None:
+    rng = np.random.default_rng(cameras)
+    scenes = [cv2.resize(rng.integers(0, 255, (6, 16), np.uint8), (8 * WIDTH, HEIGHT)) for _ in range(cameras)]
+    topic = next(topic for topic, one in drive_messages() if one.__msgtype__.endswith("CompressedImage"))
+    drive: list[tuple[str, Any]] = [one for one in drive_messages() if one[0] != topic]
+    for k in range(12):
+        image = scenes[k % cameras][:, 2 * k : 2 * k + WIDTH]
+        message = compressed_image_message(10**9 + k * 100_000_000)
+        message.data = np.frombuffer(cv2.imencode(".png", image)[1].tobytes(), np.uint8)
+        drive.append((topic, message))
+    recording: Any = open_source(str(Bag(drive).write(tmp_path / "b.mcap")))
+    texts = [one.text for one in recording.recognitions if one.code == "several_cameras"]
+    assert [f"probably {cameras} cameras publish" in text for text in texts] == [True] * (cameras > 1)
+
+
 def test_several_topics_of_a_type_have_to_be_selected_from(tmp_path: Path) -> None:
     path = Bag(
         [*drive_messages(), ("/rear/image", compressed_image_message(5)), ("/imu/odom", odometry_message(5, 1.0))]

@@ -1,6 +1,7 @@
 """How the vehicle moves, in bags of every kind: velocities, else transforms, else turn rates; and when points were
 measured."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +73,18 @@ def test_the_motion_in_transforms(tmp_path: Path) -> None:
         assert motion.linear_mps == pytest.approx(TWIST[3:], abs=1e-6)
         assert motion.angular_radps == pytest.approx(TWIST[:3], abs=1e-6)
     assert 0 < len(motions(recording, [0])) <= len(result), "a chosen frame gets those near it"
+
+
+def test_velocities_of_two_frames_on_one_topic_have_to_be_selected_from(tmp_path: Path) -> None:
+    drive = list(DRIVE)
+    for place, (topic, message) in enumerate(DRIVE):
+        if topic == "/odom" and place % 2:
+            drive[place] = (topic, replace(message, child_frame_id="ego"))
+    with pytest.raises(SourceError, match=r"/odom are of the motion of 2 frames: 'base', 'ego'.*\?odometry_frame=NAME"):
+        opened(tmp_path, drive)
+    selected = motions(opened(tmp_path, drive, "?odometry_frame=ego"))
+    assert {one.frame_id for one in selected} == {"ego"}
+    assert 0 < len(selected) < 20
 
 
 def test_any_topic_of_motion_is_taken_that_is_requested(tmp_path: Path) -> None:

@@ -30,6 +30,8 @@ def text(sweep_begin_ns: int, camera_begin_ns: int = BEGIN_NS, scale: int = 1) -
         (18.0, "this is GPS time - UTC"),
         (19.02, "this is TAI - GPS time"),
         (-7200.0, "whole hours, -2: one driver probably stamps in local time"),
+        (-315_964_782.0, "GPS time, which counts from 1980"),
+        (-315_964_800.0, "GPS time, which counts from 1980, lacks to time since 1970, without its leap seconds"),
     ],
 )
 def test_known_differences_are_named(offset_s: float, cause: str) -> None:

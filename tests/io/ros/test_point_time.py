@@ -339,3 +339,42 @@ def test_times_on_another_clock_are_refused_with_what_to_type(base: Literal["beg
 
     frame = sweep(payload, PointTimeConfig(field="timestamp", unit="ns", base=base))
     assert offsets_s(frame) == pytest.approx(RISING_S + begin_s, abs=1e-6)
+
+
+def two_times(first: tuple[str, str, list[float]], second: tuple[str, str, list[float]]) -> bytes:
+    xyz: Columns = [(axis, "<f4", [float(k + 1) for k in range(POINTS)]) for axis in "xyz"]
+    return packed_cloud([*xyz, first, second], sec=STAMP_S, nsec=STAMP_REST_NS)
+
+
+@pytest.mark.parametrize("unused", [[0.0] * POINTS, [7.0] * POINTS])
+@pytest.mark.parametrize("name", ["t", "timestamp"])
+def test_of_two_fields_the_one_that_differs_from_point_to_point_counts(name: str, unused: list[float]) -> None:
+    frame = sweep(two_times((name, "<u4", unused), ("time", "<f4", SWEEP_S.tolist())))
+    assert offsets_s(frame) == pytest.approx(SWEEP_S, abs=1e-6)
+    assert frame.timed_by.startswith("time: ")
+    assert not frame.recognitions
+
+
+def test_of_two_fields_one_that_cannot_be_a_time_does_not_count() -> None:
+    frame = sweep(
+        two_times(("t", "<f8", (SWEEP_S + 5e8).tolist()), ("timestamp", "<f8", (SWEEP_S + STAMP_NS * 1e-9).tolist()))
+    )
+    assert offsets_s(frame) == pytest.approx(SWEEP_S, abs=1e-5)
+
+
+def test_two_fields_that_agree_are_one_time_and_others_are_refused() -> None:
+    on_clock = SWEEP_S + STAMP_NS * 1e-9
+    agreed = sweep(two_times(("time", "<f4", SWEEP_S.tolist()), ("timestamp", "<f8", on_clock.tolist())))
+    assert offsets_s(agreed) == pytest.approx(SWEEP_S, abs=1e-6)
+    payload = two_times(("time", "<f4", SWEEP_S.tolist()), ("timestamp", "<f8", (on_clock - 0.05).tolist()))
+    error = refused(payload)
+    assert error.reason == "cloud_time_ambiguous"
+    assert "contradict each other, time: float32, s since the stamp" in str(error)
+    assert "?time=FIELD,UNIT,BASE" in str(error)
+    selected = sweep(payload, PointTimeConfig(field="timestamp", unit="s", base="clock"))
+    assert offsets_s(selected) == pytest.approx(SWEEP_S - 0.05, abs=1e-6)
+
+
+def test_a_time_of_day_in_a_number_that_is_too_coarse_is_named() -> None:
+    error = refused(cloud_timed("timestamp", "<f4", (SWEEP_S + STAMP_S).tolist()))
+    assert "come in steps of 128, too coarse for a clock" in str(error)

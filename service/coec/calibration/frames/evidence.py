@@ -197,6 +197,7 @@ class TwistReading(StrEnum):
     BACKWARDS = "backwards"
     KM_PER_H = "in km/h"
     DEGREES = "given with turn rates in degrees"
+    OTHER_SIGN = "given with turn rates of the other sign"
     NO_TURN = "without turn rates"
     CONTRADICTED = "contradicted by the poses"
 
@@ -232,22 +233,31 @@ def reading_of_twists(messages: Sequence[PoseAndTwist]) -> TwistReading:
     )
     if of_velocity is not TwistReading.AS_STATED:
         return of_velocity
-    in_degrees = {TwistReading.AS_STATED: angular, TwistReading.DEGREES: np.radians(angular)}
-    of_turn = _reading(moved[:, :3], in_degrees, TURNING_RADPS)
+    turns = {
+        TwistReading.AS_STATED: angular,
+        TwistReading.DEGREES: np.radians(angular),
+        TwistReading.OTHER_SIGN: -angular,
+    }
+    of_turn = _reading(moved[:, :3], turns, TURNING_RADPS, or_stated=True)
     if of_turn is TwistReading.NOT_FILLED_IN:
         return TwistReading.NO_TURN
-    return of_turn if of_turn is TwistReading.DEGREES else TwistReading.AS_STATED
+    return TwistReading.AS_STATED if of_turn is TwistReading.CONTRADICTED else of_turn
 
 
 def _reading(
-    moved: NDArray[np.float64], readings: Mapping[TwistReading, NDArray[np.float64]], least: float
+    moved: NDArray[np.float64],
+    readings: Mapping[TwistReading, NDArray[np.float64]],
+    least: float,
+    *,
+    or_stated: bool = False,
 ) -> TwistReading:
-    """The reading that fits what moved (N, 3) by the poses, where that is at least `least`."""
+    """The reading that fits what moved (N, 3) by the poses, where that is at least `least`, `or_stated` as much."""
     rate = np.linalg.norm(moved, axis=1)
-    moving = rate >= least
+    stated = np.linalg.norm(readings[TwistReading.AS_STATED], axis=1)
+    moving = (rate >= least) | ((stated >= least) & (rate > 0.0) & or_stated)
     if moving.sum() < LEAST_MOVES:
         return TwistReading.AS_STATED
-    if np.median(np.linalg.norm(readings[TwistReading.AS_STATED][moving], axis=1)) <= STANDING * least:
+    if np.median(stated[moving]) <= STANDING * least:
         return TwistReading.NOT_FILLED_IN
     off = {
         reading: float(np.median(np.linalg.norm(values - moved, axis=1)[moving] / rate[moving]))

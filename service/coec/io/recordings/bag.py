@@ -102,12 +102,18 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
     index.require_one_frame(lidar_topic, query.get("lidar_frame"), "lidar_frame")
     with storage.open() as reader:
         streams, of_twists = _streams(
-            index, reader, camera_topic, lidar_topic, (frames, query.get("odometry")), readings
+            index,
+            reader,
+            camera_topic,
+            lidar_topic,
+            (frames, query.get("odometry"), query.get("odometry_frame")),
+            readings,
         )
         camera = _first_image(spec.path, _Images(storage, reader, streams.video), streams.camera)
         cloud = _load(storage, reader, streams.lidar[0].clouds[0], clouds)
         motions = [*streams.moved[:1], *(_load(storage, reader, place, clouds) for place in streams.motion[:1])]
         motion = motions[0] if motions else None
+        of_images = None if streams.video is not None else _of_images(_Images(storage, reader, None), streams.camera)
         of_transforms = index.connect(query.get("camera_frame", camera.frame_id), cloud.frame_id, reader)
     if not (isinstance(camera, CameraFrame) and isinstance(cloud, LidarFrame) and isinstance(motion, EgoMotion | None)):
         raise SourceError(f"{spec.path}: {camera_topic} holds no images, or no motion on the topic named for it")
@@ -119,6 +125,7 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
     recognitions = (
         *of_clocks,
         *_of_video(streams.video),
+        *(() if of_images is None else (of_images,)),
         *index.streams[lidar_topic].notes,
         *of_transforms,
         *of_rig,
@@ -158,9 +165,10 @@ def _connected(
     if requested is not None:
         raise SourceError(f"{index.path}: /tf_static does not connect {requested!r} and {lidar_frame!r}")
     text = (
-        f"The motion is that of the frame {motion.frame_id!a}, which /tf_static does not connect with "
-        f"{lidar_frame!a}: it is left out, and nothing is compensated for motion. Record /tf_static of the whole "
-        f"vehicle, or name a frame with its axes: ?odometry_frame=NAME ({lidar_frame}: the motion is the LiDAR's own)."
+        f"The motion is that of the frame {motion.frame_id!a} (of an odometry, its child_frame_id, or without one the "
+        f"frame of its header), which /tf_static does not connect with {lidar_frame!a}: it is left out, and nothing is "
+        "compensated for motion. Record /tf_static of the whole vehicle, or name a frame with its axes: "
+        f"?odometry_frame=NAME ({lidar_frame}: the motion is the LiDAR's own)."
     )
     return None, Recognition(MOTION_LEFT_OUT, text, "warn")
 
@@ -372,12 +380,12 @@ def _streams(
     reader: BagReader,
     camera: str,
     lidar: str,
-    motion: tuple[tuple[str, str], str | None],
+    motion: tuple[tuple[str, str], str | None, str | None],
     readings: bag_recognition.Readings,
 ) -> tuple[PairStreams, Recognition | None]:
     """The streams of the pair, each cloud a sweep, and what to tell of the motion. `motion`: the vehicle's frames, and
-    the topic that was asked for."""
-    frames, requested = motion
+    the topic and the frame that were asked for."""
+    frames, requested, moving_frame = motion
     motion_source = bag_index.motion_topic(index, reader, frames, requested)
     places = index.streams[motion_source].ordered() if motion_source in index.streams else []
     moved = (
@@ -388,6 +396,8 @@ def _streams(
     for topic in (camera, lidar):
         _require_stamps(index, topic)
     of_twists = None
+    if places and motion_source is not None:
+        places = bag_recognition.motions_of_one_frame(reader, places, motion_source, moving_frame)
     if places and places[0].type_name == messages.ODOMETRY:
         by_poses, of_twists = bag_recognition.motion_of_odometry(reader, places, readings.motion)
         places, moved = (places, moved) if by_poses is None else ([], by_poses)
@@ -478,6 +488,16 @@ def _first_image(path: Path, images: _Images, places: Sequence[bag_index.Message
         f"{path}: none of the first pictures of the video can be decoded: it is damaged, or larger than {MAX_PIXELS} "
         "pixels"
     )
+
+
+def _of_images(images: _Images, places: Sequence[bag_index.MessageLocation]) -> Recognition | None:
+    """What to tell of images in the middle of a recording."""
+    begin = max(0, (len(places) - bag_recognition.COMPARED_IMAGES) // 2)
+    loaded = map(images.load, places[begin : begin + bag_recognition.COMPARED_IMAGES])
+    try:
+        return bag_recognition.alternating_cameras([one for one in loaded if isinstance(one, CameraFrame)])
+    except (DecodeError, SourceError):
+        return None  # it is reported when it is used
 
 
 def _of_video(video: VideoTrack | None) -> tuple[Recognition, ...]:

@@ -127,7 +127,8 @@ class TopicStream:
     Attributes:
         videos: of a topic of video, the packets by the frame that they name; `locations` has those of pictures.
         lags_s: seconds from the stamp of each message until the recorder received it.
-        notes: what to tell of packets.
+        notes: what to tell of packets, and of clouds.
+        empty: number of clouds without a point, which are left out.
     """
 
     type_name: str
@@ -135,6 +136,7 @@ class TopicStream:
     videos: dict[str, VideoTrack] = field(default_factory=dict)
     lags_s: array[float] = field(default_factory=lambda: array("d"))
     notes: tuple[Recognition, ...] = ()
+    empty: int = 0
 
     def ordered(self) -> list[MessageLocation]:
         """The places in the order of their stamps."""
@@ -313,6 +315,9 @@ class BagIndex:
             stamp_ns = _header_stamp_ns(entry.data)
             if stamp_ns is None:
                 raise SourceError(f"{self.path}: a message on {entry.topic} has no valid header")
+            if name == messages.POINT_CLOUD and messages.is_empty_cloud(entry.data):
+                stream.empty += 1
+                return
             if stamp_ns == 0 and name in CLOUD_TYPES:
                 stamp_ns = self._stamp_of_points(entry)
             frame_id = sys.intern(messages.header_frame_id(entry.data))
@@ -330,7 +335,7 @@ class BagIndex:
             self.transforms.refuse(decoded.refused)
             self._decoded(entry, lambda _: self.transforms.add(decoded.joints))
         elif name in message_decoding.REFUSED and name != messages.TF:
-            self._leave_unread(entry.topic, f"{name}: {message_decoding.REFUSED[name]}")
+            self.leave_unread(entry.topic, f"{name}: {message_decoding.REFUSED[name]}")
         elif name == messages.TF:
             self.transforms_at.setdefault(entry.topic, []).append(entry.place)
 
@@ -342,7 +347,7 @@ class BagIndex:
                 sensor = packets.sensor(self.descriptions, metadata)
                 sweeps, notes = packets.sweeps(sensor)
             except DecodeError as error:
-                self._leave_unread(topic, f"packets of a LiDAR: {error}")
+                self.leave_unread(topic, f"packets of a LiDAR: {error}")
                 continue
             stream = self.streams.setdefault(topic, TopicStream(packets.type_name, notes=notes))
             for sweep in sweeps:
@@ -355,7 +360,8 @@ class BagIndex:
                     joint = ros_transforms.StaticTransform(sensor.pose[0], sensor.frame_id, sensor.pose[1])
                     self.transforms.add((joint,))
 
-    def _leave_unread(self, topic: str, text: str) -> None:
+    def leave_unread(self, topic: str, text: str) -> None:
+        """Notes a topic that has frames in another form, and what to do."""
         if len(self.unread) < LISTED:
             self.unread[topic] = text
 
@@ -365,13 +371,13 @@ class BagIndex:
             video = message_decoding.video_data(entry.type_name, entry.data)
         except DecodeError as error:
             if entry.type_name in VIDEO_TYPES:
-                self._leave_unread(entry.topic, f"a damaged {entry.type_name}: {error}")
+                self.leave_unread(entry.topic, f"a damaged {entry.type_name}: {error}")
             return entry.type_name not in VIDEO_TYPES  # a picture is refused when it is used
         if video is None:
             return True
         codec = codec_of(video[0])
         if codec is None:
-            self._leave_unread(entry.topic, f"video of the format {video[0][:MAX_FORMAT]!a}: H.264 and H.265 are read")
+            self.leave_unread(entry.topic, f"video of the format {video[0][:MAX_FORMAT]!a}: H.264 and H.265 are read")
             return False
         track = stream.videos.setdefault(ros_transforms.bare(frame_id), VideoTrack(codec))
         return track.add(video[1], entry.place)
@@ -414,6 +420,12 @@ def build_index(storage: BagStorage, clouds: CloudDecoder, metadata: str | None 
         except OSError as error:
             raise SourceError(f"cannot read metadata={metadata}: {error.strerror}") from error
     index.resolve_packets(given)
+    for topic, stream in index.streams.items():
+        if stream.empty:
+            text = f"{stream.empty} of the clouds on {topic} have no point, and are left out."
+            stream.notes = (*stream.notes, Recognition("clouds_empty", text, "warn"))
+        if stream.empty and not stream.locations:
+            index.leave_unread(topic, "clouds without a point")
     return index
 
 

@@ -10,12 +10,14 @@ A person can say otherwise in the query of the bag; every recognition names the 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError, model_validator
@@ -29,8 +31,9 @@ from coec.config.pair import with_direction
 from coec.errors import ConfigError, DecodeError, SourceError, UsageError
 from coec.geometry.projection import share_in_image
 from coec.io.frame_validation import MAX_SPEED
+from coec.io.images import decode_grey_reduced
 from coec.io.intrinsics_files import load_camera_document, with_camera
-from coec.io.recordings.bag_index import LISTED, BagIndex, MessageLocation
+from coec.io.recordings.bag_index import LIMITS, LISTED, BagIndex, MessageLocation
 from coec.io.recordings.bag_storage import METADATA, BagReader
 from coec.io.recordings.recording_source import MOTION_REACH_NS, evenly_spread
 from coec.io.rig_files import camera_of, load_mask, rigid_matrix
@@ -119,6 +122,63 @@ def _offset_ns(query: dict[str, str], key: str) -> int:
     if not abs(offset_s) <= MAX_OFFSET_S:
         raise UsageError(f"{key}={query[key]}: seconds that are added to the stamps, as {key}=-0.03")
     return round(offset_s * 1e9)
+
+
+COMPARED_IMAGES: Final = 9
+"""Images in a row whose likeness is compared."""
+
+ALTERNATING, UNLIKE = 0.6, 0.3
+"""Images of one camera are the less alike the longer the time between them: those of several differ by less than the
+first share of what neighbours do, which is at least the second, in standard deviations. See docs/measured.md."""
+
+_SMALL: Final = (40, 24)
+"""Size in which images are compared, px: details do not count."""
+
+
+def alternating_cameras(images: Sequence[CameraFrame]) -> Recognition | None:
+    """What to tell of images in a row, every second or third of which are alike, and neighbours are not: those of
+    several cameras."""
+    small = [cv2.resize(decode_grey_reduced(one.image, LIMITS), _SMALL, interpolation=cv2.INTER_AREA) for one in images]
+    grey = np.array(small, np.float64).reshape(len(small), -1)
+    grey = (grey - grey.mean(axis=1, keepdims=True)) / np.maximum(grey.std(axis=1, keepdims=True), 1.0)
+    if len(grey) < COMPARED_IMAGES:
+        return None
+    one, two, three = (float(np.median(np.abs(grey[lag:] - grey[:-lag]).mean(axis=1))) for lag in (1, 2, 3))
+    if one < UNLIKE or min(two, three) > ALTERNATING * one:
+        return None
+    count = 2 if two <= three else 3
+    text = (
+        f"The images alternate between {count} scenes: probably {count} cameras publish on the topic. Give each a "
+        "topic of its own, and record again."
+    )
+    return Recognition("several_cameras", text, "fail")
+
+
+def motions_of_one_frame(
+    reader: BagReader, places: Sequence[MessageLocation], topic: str, requested: str | None
+) -> list[MessageLocation]:
+    """The messages of motion that are expressed in one frame: the one that was asked for, if there are several.
+
+    Raises:
+        SourceError: some of them name several frames, and none of these was asked for; or one is damaged.
+    """
+
+    def frame_of(place: MessageLocation) -> str:
+        if place.type_name != messages.ODOMETRY:
+            return bare(place.frame_id)
+        return bare(_posed(reader, place).motion.frame_id)
+
+    sampled = [index for start in evenly_spread(len(places), SAMPLED_MOVES) for index in (start, start + 1)]
+    counts = Counter(frame_of(places[index]) for index in sampled if index < len(places))
+    if len(counts) < 2:
+        return list(places)
+    if requested is None or bare(requested) not in counts:
+        listed = ", ".join(map(ascii, sorted(counts)))
+        raise SourceError(
+            f"the messages on {topic} are of the motion of {len(counts)} frames: {listed}. Two programs publish on it: "
+            "choose one with ?odometry_frame=NAME"
+        )
+    return [place for place in places if frame_of(place) == bare(requested)]
 
 
 def motion_of_odometry(

@@ -59,8 +59,17 @@ def _begin(stamp_s: float) -> str:
     return datetime.fromtimestamp(stamp_s, UTC).isoformat(" ", "milliseconds").removesuffix("+00:00")
 
 
-TIME_SCALES_S = {37.0: "TAI - UTC (PTP without its UTC offset)", 18.0: "GPS time - UTC", 19.0: "TAI - GPS time"}
+TIME_SCALES_S = {
+    37.0: "TAI - UTC (PTP without its UTC offset)",
+    18.0: "GPS time - UTC",
+    19.0: "TAI - GPS time",
+    315_964_782.0: "what GPS time, which counts from 1980, lacks to time since 1970",
+    315_964_800.0: "what GPS time, which counts from 1980, lacks to time since 1970, without its leap seconds",
+}
 """Differences of time scales, s, since 2017."""
+
+MOST_HOURS = 26
+"""Time zones are up to so far apart."""
 
 LATE_S = 0.5
 """Messages arrive within this time."""
@@ -94,7 +103,7 @@ def offset_cause(offset_s: float, camera_s: float, sweep_s: float) -> str:
     if smaller < EPOCH_S < larger:
         return " (one stream counts from the start of a computer, the other from 1970)"
     hours = round(offset_s / 3600.0)
-    if hours and abs(offset_s - 3600.0 * hours) < START_S:
+    if 0 < abs(hours) <= MOST_HOURS and abs(offset_s - 3600.0 * hours) < START_S:
         return f" (whole hours, {hours:+d}: one driver probably stamps in local time)"
     if abs(offset_s) < LATE_S:
         return " (one of the two is probably stamped when it was received, not when it was measured)"

@@ -25,7 +25,7 @@ from coec.errors import DecodeError, SourceError
 from coec.geometry.points import lengths
 from coec.io.frame_validation import Refusal, finite_rows
 from coec.io.recordings.cloud_formats import MAX_POINTS, TableError, columns_of_las, parse_pcd, parse_ply, viewpoint_of
-from coec.io.ros.point_clouds import FIELDS, offsets_s
+from coec.io.ros.point_clouds import FIELDS, offsets_s, time_field
 from coec.io.user_files import read_bytes, read_npy, read_npz
 
 Columns = Mapping[str, NDArray[Any]]
@@ -154,7 +154,8 @@ def _times(
     if point_time is None and _WRITTEN_OFFSET in columns:
         return np.asarray(columns[_WRITTEN_OFFSET], dtype=np.float32), ""
     names = FIELDS if point_time is None else (point_time.field,)
-    name = next((name for name in names if name in columns and columns[name].dtype.kind in "fiu"), None)
+    timed = {name: columns[name] for name in names if name in columns and columns[name].dtype.kind in "fiu"}
+    name = next(iter(timed), None) if point_time is not None else time_field(timed, keep, stamp_ns)
     if name is None:
         return None, ""
     try:

@@ -228,6 +228,15 @@ def header_frame_id(payload: bytes) -> str:
     return payload[begin : begin + length].rstrip(b"\0").decode(errors="replace")[:MAX_FRAME_ID]
 
 
+def is_empty_cloud(payload: bytes) -> bool:
+    """Whether a `PointCloud2` states that it has no point."""
+    try:
+        head = check_header(payload)
+        return head.number() * head.number() == 0
+    except DecodeError:
+        return False
+
+
 def check_cloud_fields(payload: bytes) -> None:
     """Checks the fields of a `PointCloud2`, or of a packed one.
 

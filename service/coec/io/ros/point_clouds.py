@@ -73,6 +73,9 @@ SHORTEST_S: Final = 1e-3
 LONGEST_S: Final = 10.0
 """Longest sweep, as the longest period of `config.SweepConfig`."""
 
+DIFFERENT_S: Final = 5e-3
+"""Two fields that time a point so differently contradict each other: 5 cm at 10 m/s."""
+
 NEAR_S: Final = 1.0
 """Most time between a sweep and its stamp: drivers stamp its begin, middle or end, or the instant of sending it."""
 
@@ -165,6 +168,38 @@ def offsets_s(
     return _after_stamp_s(values, reading), line
 
 
+def time_field(columns: Mapping[str, NDArray[Any]], keep: NDArray[np.bool_] | None, stamp_ns: int) -> str | None:
+    """The first of `FIELDS` in some columns that holds the time of the points; None without any. One that is equal for
+    all points, or cannot be a time, counts only if all are so. Arguments as for `offsets_s`.
+
+    Raises:
+        DecodeError: `cloud_time_ambiguous`: two of them give different times.
+    """
+    names = [name for name in FIELDS if name in columns]
+    if len(names) < 2 or not stamp_ns:
+        return names[0] if names else None
+    read: dict[str, tuple[NDArray[np.float32], str]] = {}
+    for name in names:
+        values = columns[name] if keep is None else columns[name][keep]
+        if not np.ptp(_range(values)):
+            continue
+        try:
+            offset_s, line = offsets_s(name, values, None, stamp_ns, None)
+        except DecodeError as error:
+            if error.reason != Refusal.CLOUD_TIME:
+                raise
+            continue
+        if np.ptp(offset_s) >= SHORTEST_S:
+            read[name] = offset_s, line
+    first = next(iter(read), names[0])
+    for other_s, other in list(read.values())[1:]:
+        if np.abs(read[first][0] - other_s).max() > DIFFERENT_S:
+            text = f"the points have two times that contradict each other, {read[first][1]}; and {other}"
+            way = "say which with ?time=FIELD,UNIT,BASE of a bag (`lidar.time` live)"
+            raise DecodeError(Refusal.CLOUD_TIME_AMBIGUOUS, f"{text}: {way}")
+    return first
+
+
 def stamp_in(column: NDArray[Any], keep: NDArray[np.bool_] | None, configured: PointTimeConfig | None) -> int | None:
     """The time of the first point, ns, for a cloud without a stamp; None if its points have no time of day, or not the
     one in the configuration. Arguments as for `offsets_s`."""
@@ -190,7 +225,9 @@ def recognised(name: str, dtype: np.dtype[Any], begin: float, end: float, stamp_
     counts = dtype.kind != "f"
     units: tuple[TimeUnit, ...] = ("ns", "us", "ms", "s") if counts else ("s", "ms", "us", "ns")
     bases: tuple[TimeBase, ...] = ("stamp", "clock")
-    every = [_read(begin, end, unit, base, stamp_ns) for base in bases for unit in units]
+    step = 0.0 if counts else float(np.spacing(dtype.type(max(abs(begin), abs(end)))))
+    read = (_read(begin, end, unit, base, stamp_ns) for base in bases for unit in units)
+    every = [one for one in read if one.base != "clock" or step / _TICKS[one.unit] <= FINEST_S]
     near = [reading for reading in every if reading.begin_s <= NEAR_S and reading.end_s >= -NEAR_S]
     sweeps = _as_named(name, [reading for reading in near if SHORTEST_S <= reading.lasts_s <= LONGEST_S])
     instants = _as_named(name, [reading for reading in near if reading.lasts_s < SHORTEST_S])
@@ -202,7 +239,7 @@ def recognised(name: str, dtype: np.dtype[Any], begin: float, end: float, stamp_
         raise DecodeError(
             Refusal.CLOUD_TIME,
             f"the times in the field {name} of the points are not near the stamp of their sweep in any unit: "
-            f"{_other_clock(name, begin, end, units, stamp_ns)}",
+            f"{_other_clock(name, step, begin, end, units, stamp_ns)}",
         )
     first = candidates[0]
     if all(_agree(first, other) for other in candidates):
@@ -216,8 +253,13 @@ def recognised(name: str, dtype: np.dtype[Any], begin: float, end: float, stamp_
     )
 
 
-def _other_clock(name: str, begin: float, end: float, units: Sequence[TimeUnit], stamp_ns: int) -> str:
-    """What times may be that are not near the stamp, and what to type."""
+def _other_clock(name: str, step: float, begin: float, end: float, units: Sequence[TimeUnit], stamp_ns: int) -> str:
+    """What times may be that are not near the stamp, and what to type. `step`: between neighbouring numbers."""
+    if step > 1.0:
+        return (
+            f"as large as these, such numbers come in steps of {step:g}, too coarse for a clock: let the driver write "
+            "float64, or times since the stamp"
+        )
     for reading in (_read(begin, end, unit, "clock", stamp_ns) for unit in reversed(units)):
         if SHORTEST_S <= reading.lasts_s <= 0.1 * LONGEST_S and abs(reading.begin_s) > NEAR_S:
             begins, ends = (f"{name},{reading.unit},{base}" for base in ("begin", "end"))
@@ -536,10 +578,12 @@ def _times(
 ) -> _Times:
     """`keep` as in `offsets_s`."""
     names = FIELDS if configured is None else (configured.field,)
-    name = next((name for name in names if name in by_name), None)
-    column = None if name is None else _column(message, by_name[name], "fiu")
+    there = {name: _column(message, by_name[name], "fiu") for name in names if name in by_name}
+    columns = {name: column for name, column in there.items() if column is not None}
+    name = next(iter(columns), None) if configured is not None else time_field(columns, keep, stamp_ns)
+    column = None if name is None else columns[name]
     recognitions: tuple[Recognition, ...] = ()
-    if name is None and configured is None:
+    if not there and configured is None:
         name, column, recognitions = _unknown_time(message, by_name, keep, stamp_ns)
     if name is None or column is None:
         return _Times(stamp_ns, None, "", recognitions)
