@@ -92,6 +92,16 @@ def test_what_opencv_writes_itself(tmp_path: Path) -> None:
     assert with_camera(document, path)["camera"] == {**PINHOLE, "model": "radtan", **RADTAN, "k3": 0.0}
 
 
+@pytest.mark.parametrize("behind", ["---\n", "---\nheight: 3\n---\n", ""])
+@pytest.mark.parametrize("before", ["", "%YAML:1.0\n---\n", "# printed\n---\n"])
+def test_what_ros2_topic_echo_prints(tmp_path: Path, before: str, behind: str) -> None:
+    path = tmp_path / "info.yaml"
+    printed = f"header:\n  frame_id: camera\nheight: 400\nwidth: 640\ndistortion_model: plumb_bob\nd: []\nk: {FLAT}\n"
+    path.write_text(f"{before}{printed}{behind}")
+    content, name = load_camera_document(path)
+    assert with_camera(content, path, name)["camera"] == PINHOLE
+
+
 def test_a_size_that_the_file_does_not_hold_is_that_of_the_images() -> None:
     assert with_camera({"camera_matrix": {"data": FLAT}}, Path("file"), size=(640, 400)) == {"camera": PINHOLE}
     with pytest.raises(SourceError, match="image_width is missing"):
@@ -133,6 +143,12 @@ def test_one_of_several_cameras_is_named_behind_the_path(tmp_path: Path) -> None
 def test_what_describes_no_lens_is_refused_by_name(document: dict[str, Any], complaint: str) -> None:
     with pytest.raises(SourceError, match=complaint):
         with_camera(document, Path("file"))
+
+
+def test_the_text_of_camera_calibration_is_refused_with_the_way_out(tmp_path: Path) -> None:
+    (tmp_path / "ost.txt").write_text("# oST version 5.0 parameters\n\n[image]\n\nwidth\n640\n")
+    with pytest.raises(SourceError, match=r"ost\.yaml beside it"):
+        load_camera_document(tmp_path / "ost.txt")
 
 
 def test_xml_of_opencv_is_refused_with_the_way_out(tmp_path: Path) -> None:

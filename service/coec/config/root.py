@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -182,8 +183,8 @@ each, or of 14,000 without."""
 MERGE = "tag:yaml.org,2002:merge"
 
 
-def load_yaml(path: Path) -> Any:
-    """The document of a YAML 1.2 file.
+def load_yaml(path: Path, *, first: bool = False) -> Any:
+    """The document of a YAML 1.2 file; with `first`, of several the first, as `ros2 topic echo` writes messages.
 
     Raises:
         ConfigError: the file cannot be read or is not YAML.
@@ -200,6 +201,10 @@ def load_yaml(path: Path) -> Any:
     except UnicodeDecodeError as error:
         detail = f"byte {error.start} is not UTF-8 text"
         raise ConfigError(f"{path} is not valid YAML: {detail}; is it the right file?") from error
+    if first:
+        head, *others = re.split(r"(?m)^---[ \t]*$", text)
+        is_document = any(line.strip() and line[0] not in "%#" for line in head.splitlines())
+        text = head if is_document or not others else f"{head}---{others[0]}"
     try:
         return parse_yaml(text)
     except ConfigError as error:

@@ -69,14 +69,16 @@ def load_camera_document(path: Path) -> tuple[Any, str]:
 
     Raises:
         ConfigError: the file cannot be read or is not YAML.
-        SourceError: it is XML.
+        SourceError: it is XML, or ROS's ost.txt.
     """
     file, name = path, ""
     if not path.exists() and "#" in path.name:
         file, name = path.with_name(path.name.rpartition("#")[0]), path.name.rpartition("#")[2]
+    if file.suffix in (".txt", ".ini"):
+        raise SourceError(f"{file} is no YAML or JSON: ROS's camera_calibration writes the same as ost.yaml beside it")
     if file.suffix == ".xml":
         raise SourceError(f"{file} is XML: OpenCV's FileStorage writes the same as YAML if the name ends with .yml")
-    return load_yaml(file), name
+    return load_yaml(file, first=True), name
 
 
 def cameras_of(document: Any, size: tuple[int, int] | None = None) -> dict[str, CameraFile]:

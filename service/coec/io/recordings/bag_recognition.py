@@ -572,7 +572,14 @@ def _lens_of(index: BagIndex, pair: PairMessages) -> _Lens:
     path = expand_home(pair.intrinsics)
     content, name = load_camera_document(path)
     size = (pair.image.image.width, pair.image.image.height)
-    document = IntrinsicsFile.model_validate(with_camera(content, path, name, rectified=rectified, size=size))
+    described = with_camera(content, path, name, rectified=rectified, size=size)
+    if not isinstance(described, dict) or "camera" not in described:
+        raise SourceError(
+            f"{path} describes no camera that is known: it may be a CameraInfo of ROS in YAML, a camera chain of "
+            "Kalibr, a calibration of Basalt, matrices of OpenCV, the JSON of Apollo or SensorsCalibration, or have "
+            "`camera:` as a dataset.yaml has"
+        )
+    document = IntrinsicsFile.model_validate(described)
     camera = camera_of(document.camera)
     T, mask = document.T_camera_lidar, document.mask
     return _Lens(
