@@ -78,7 +78,7 @@ class Course:
         kills: how often there was a worker to kill.
         threads_lost: of the service, over all phases.
         recovery_s: sensor time from the last fault to a right pose called healthy; None: not within the patience.
-        ended: why the service ended before its time; None if it did not.
+        finished: why the service ended before its time; None if it did not.
     """
 
     phases: dict[str, list[Sample]] = field(default_factory=dict)

@@ -58,7 +58,7 @@ class Vehicle:
 
     Attributes:
         real: whether /opt/coec holds what the Dockerfile built; else this checkout's programs stand for it.
-        said: name of a step to what came of it.
+        reported: name of a step to what came of it.
     """
 
     real: bool

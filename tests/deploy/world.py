@@ -56,8 +56,8 @@ class World:
     """What passes on the network, and what is said to those who are not the router.
 
     Attributes:
-        names_asked: of the name server.
-        told: to the listener, the first bytes of each caller.
+        names_requested: of the name server.
+        reported: to the listener, the first bytes of each caller.
         unseen: packets that came faster than they were looked at; known at the end.
     """
 

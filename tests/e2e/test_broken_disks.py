@@ -42,7 +42,7 @@ class Beats:
     """What a service manager hears.
 
     Attributes:
-        heard_s: when it was told that all is well (steady clock).
+        received_s: when it was told that all is well (steady clock).
     """
 
     def __init__(self, address: Path) -> None:

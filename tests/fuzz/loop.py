@@ -51,7 +51,7 @@ class Target:
         read: gives it an input; there is a folder for those that read files.
         seeds: inputs that it takes, to begin with.
         mutations: those that know the format.
-        words: what it looks for.
+        labels: what it looks for.
         refusals: the errors with which it may end.
     """
 

@@ -166,7 +166,7 @@ class RigEstimatorBench:
 
     Attributes:
         pairs: by camera.
-        told: what was told, in order.
+        states: what the rig reported, in order.
     """
 
     def __init__(self, folder: Path, cameras: tuple[str, ...] = CAMERAS, poses: CameraPoses = POSES) -> None:

@@ -16,7 +16,7 @@ class DiagnosticFigure:
 
     Attributes:
         unit: of value and limit; empty for a share, a ratio, or a count.
-        tells: what it measures, a sentence.
+        measures: what it measures, a sentence.
         fails: what it means beyond its limit, without a full stop.
         advice: what to do then.
     """

@@ -147,14 +147,14 @@ def run(
 
     Args:
         jobs: the windows.
-        terms: the terms on which all windows are judged.
+        settings: the terms on which all windows are judged.
         engine: the engine that judges them.
         folder: folder for the tables. If it already holds a batch, that batch is continued.
-        told: called with every row, once it is on the disk.
+        on_row: called with every row, once it is on the disk.
         resume: whether the folder may already hold a batch.
 
     Raises:
-        UsageError, OutputError, SourceError: the folder cannot be used; see `Results`.
+        UsageError, OutputError, SourceError: the folder cannot be used; see `BatchFolder`.
         FleetError: the engine failed, or windows could not be judged for a common cause. Finished rows are kept.
     """
     results = BatchFolder(folder, settings, resume=resume)

@@ -48,7 +48,7 @@ class ExtrinsicOrigin:
         version: of coec.
         provenance: `nominal`, `commissioned`, `estimated` or `restored`.
         window_id, data_stamp_ns, config_hash: of the window that it rests on; None if there is none.
-        objections: why it is not accepted, one sentence each; empty if it is accepted.
+        rejection_reasons: why it is not accepted, one sentence each; empty if it is accepted.
     """
 
     vehicle: str
@@ -73,7 +73,7 @@ class ExportedExtrinsic:
         parent, child: names of the frames; the child is the camera.
         T_parent_lidar: (4, 4) pose of the LiDAR in the parent; identity if the parent is the LiDAR.
         camera: intrinsics; None if they are not known.
-        origin: see `Origin`.
+        origin: see `ExtrinsicOrigin`.
     """
 
     T_camera_lidar: Matrix

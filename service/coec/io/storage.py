@@ -114,7 +114,8 @@ def add_name(path: Path, other: Path) -> None:
 
 def quarantine(path: Path, suffix: str) -> None:
     """Give a file that is about to be replaced a second name beside it: its name and `suffix`, then `suffix`-1, -2 and
-    so on. Does nothing if the file does not exist. The first `MAX_ASIDE` are kept, and the newest of the later ones."""
+    so on. Does nothing if the file does not exist. The first `MAX_QUARANTINED` are kept, and the newest of the
+    later ones."""
     names = [
         _with_suffix(path, suffix),
         *(_with_suffix(path, f"{suffix}-{number}") for number in range(1, MAX_QUARANTINED + 1)),

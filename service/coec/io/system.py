@@ -172,7 +172,7 @@ FRAME_ALLOCATION_BYTES = 8 * 2**20
 that was just freed. If it were mapped anew each time, the system would clear every page first. See docs/measured.md."""
 
 RETAINED_HEAP_BYTES = 32 * 2**20
-"""Free memory that may stay at the end of the heap until `give_back`."""
+"""Free memory that may stay at the end of the heap until `trim_heap`."""
 
 
 def limit_arenas() -> None:
@@ -187,7 +187,7 @@ def return_large_allocations() -> None:
 
 def reuse_frame_memory() -> None:
     """For a process through which frames pass: later frames reuse the memory of earlier ones. Larger memory goes back
-    to the system at once, the rest with `give_back`."""
+    to the system at once, the rest with `trim_heap`."""
     _set_malloc_option(M_MMAP_THRESHOLD, FRAME_ALLOCATION_BYTES)
     _set_malloc_option(M_TRIM_THRESHOLD, RETAINED_HEAP_BYTES)
     _set_malloc_option(M_TOP_PAD, FRAME_ALLOCATION_BYTES)

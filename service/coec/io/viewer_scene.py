@@ -190,8 +190,8 @@ TOPIC_DESCRIPTIONS: Mapping[str, str] = {
 
 
 def topics_for(camera: Camera) -> Mapping[str, str]:
-    """The topics of a pair with this camera: all but `CALIBRATION`, if viewers have no model for it. A topic on which
-    nothing comes is not advertised, because viewers wait for it."""
+    """The topics of a pair with this camera: all but `CALIBRATION_TOPIC`, if viewers have no model for it. A topic on
+    which nothing comes is not advertised, because viewers wait for it."""
     if viewer_camera(camera) is not None:
         return TOPIC_DESCRIPTIONS
     return {topic: held for topic, held in TOPIC_DESCRIPTIONS.items() if topic != CALIBRATION_TOPIC}
@@ -348,7 +348,7 @@ def _bands(uv_px: NDArray[np.float64], range_m: NDArray[np.float64], radius_px: 
 
 
 def thin_cloud(xyz_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    """At most `CLOUD_POINTS` of the points (N, 3), each with its range: (n, 4), metres."""
+    """At most `MAX_CLOUD_POINTS` of the points (N, 3), each with its range: (n, 4), metres."""
     points_m = xyz_m[thinned(len(xyz_m), MAX_CLOUD_POINTS)].astype(np.float64)
     range_m = np.sqrt((points_m**2).sum(axis=1))
     return np.column_stack([points_m, range_m]).astype(np.float32)

@@ -102,7 +102,7 @@ class Chart:
     """A plot with its axes.
 
     Attributes:
-        told: what the plot shows, in a sentence, for readers who cannot see it.
+        description: what the plot shows, in a sentence, for readers who cannot see it.
         log_y: whether y is logarithmic; then values at or below zero are not drawn.
         x_ticks: ticks with their labels, to replace round numbers.
         from_zero: y begins at zero.
@@ -378,7 +378,7 @@ class Disc:
     """A plot.
 
     Attributes:
-        told: what the plot shows, in a sentence, for readers who cannot see it.
+        description: what the plot shows, in a sentence, for readers who cannot see it.
         compass: labels at the right, at the top, at the left and at the bottom.
         rings: inside the rim; the rim itself has no label.
         dots: later ones lie on top.

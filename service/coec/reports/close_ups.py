@@ -54,7 +54,7 @@ BEND_RAD = radians(35.0)
 next line (HDL-64: 0.17 and 0.4 degrees)."""
 
 COMPARED = 96
-"""Each range edge is compared with so many next in azimuth: except in foliage, fewer lie within `ASIDE_RAD`."""
+"""Each range edge is compared with so many next in azimuth: except in foliage, fewer lie within `SAME_AZIMUTH_RAD`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -211,7 +211,7 @@ class DifferenceRegion:
     """A part of an image, and figures of what is swept there, weighted by worth.
 
     Attributes:
-        worth: the sum, px² · σ².
+        information: the sum, px² · σ².
         across_px: the median shift across outlines.
         strength: of the image's edges under the outlines, at the one extrinsic and at the other, standard deviations.
     """
@@ -618,7 +618,7 @@ def sentences(
             "the image. Axes: pixels."
         )
         if caption.covariance is not None:
-            lines.append(f"σ: standard deviation to which {caption.after} is known, at what is shown.")
+            lines.append(f"σ: standard deviation of {caption.after} at what is shown.")
         before, after = telling.strength
         lines.append(
             "Edges: mean strength of the image's edges under the outlines; 0 as anywhere in the image, 1 as its "

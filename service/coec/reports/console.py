@@ -49,7 +49,7 @@ class CompilationProgress:
         self._names: set[str] = set()
 
     def on_kernel(self, kernel: str) -> None:
-        """Called by `compile_news` when a kernel is begun."""
+        """Called by `compilation_events` when a kernel is begun."""
         if self._began_s is None:
             self._began_s = self._now_s()
         self._names.add(kernel)

@@ -139,7 +139,7 @@ def axes_table(
         lines.append(
             page.AxisLine(
                 name=AXIS_NAMES[axis],
-                value=axis_value(value, axis) if known else labels.get(axis, "not told"),
+                value=axis_value(value, axis) if known else labels.get(axis, "not known"),
                 sigma=axis_value(sigma, axis, sign=False) if known else "",
                 unit=SHOWN_UNITS[unit],
                 share=value / scale if known and value is not None else None,

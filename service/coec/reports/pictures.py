@@ -288,12 +288,12 @@ def sentences(window: Window, shifts: LocalShifts, name: str, sigma: NDArray[np.
         for deg, px, way, axis in ((right, right_px, "right", 1), (down, down_px, "down", 0))
     ]
     lines += [
-        f"{known} of {eligible} parts tell, from {pairs}. Their range edges lie {away} beside the edges of the image "
-        f"(median; a pixel is {degrees(pixel_rad(window.rig.camera)):.3f}° on the axis).",
+        f"{known} of {eligible} parts of the image are measured, from {pairs}. Their range edges lie {away} beside the "
+        f"edges of the image (median; a pixel is {degrees(pixel_rad(window.rig.camera)):.3f}° on the axis).",
         f"In common to all: {', '.join(turns)}. That much the extrinsic may be off.",
         f"Half of the parts are within {spread:.2f}° of that: a part alone has few range edges.",
         "Arrows: where range edges would lie best, enlarged. Figures: how far that is, and of how many range edges. "
-        "No colour: not told.",
+        "No colour: not measured.",
     ]
     return lines
 

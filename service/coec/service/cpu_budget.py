@@ -129,7 +129,7 @@ class Share:
     """What one pair takes of the budget.
 
     Attributes:
-        look_s: processor time of a check, s; None before the first.
+        check_s: processor time of a check, s; None before the first.
         window_s: processor time of a window with the depth of its images, s; None before the first.
         suspected: the pair is suspected, so its checks come first.
         waiting: a check of the pair waits for its turn.
@@ -145,9 +145,9 @@ class Share:
 
 @dataclass(slots=True)
 class _PairBudget:
-    """A pair that shares the budget. `asked_s`: when it last asked; `waits`: whether it was refused then. `begun_s`:
-    when its last check began. `has_windows`: False if it wants looks only. `in_hand`: number of checks that have begun
-    and not ended. `prepared_s`: cost of the depth for the open window so far."""
+    """A pair that shares the budget. `requested_s`: when it last asked; `waits`: whether it was refused then.
+    `started_s`: when its last check began. `has_windows`: False if it wants checks only. `in_hand`: number of
+    checks that have begun and not ended. `prepared_s`: cost of the depth for the open window so far."""
 
     period_s: float
     debt: Debt
@@ -351,7 +351,7 @@ class CpuUsage:
             self._bins.popleft()
 
     def cores(self, now_s: float) -> float:
-        """Cores in use on average over the last `OVER_S`, or since the beginning."""
+        """Cores in use on average over the last `USAGE_OVER_S`, or since the beginning."""
         spent_s = sum(cpu_s for index, cpu_s in self._bins if index * USAGE_BIN_S >= now_s - USAGE_OVER_S)
         return spent_s / max(min(now_s - self._begin_s, USAGE_OVER_S), USAGE_BIN_S)
 
@@ -367,8 +367,8 @@ class BudgetReport:
 
     Attributes:
         cores: the budget, in cores.
-        spent: what the worker has spent on everything, in cores, over the last `spending.OVER_S`.
-        wanted: what all checks and windows would need, in cores.
+        spent: what the worker has spent on everything, in cores, over the last `USAGE_OVER_S`.
+        demand: what all checks and windows would need, in cores.
         stretched_by: factor by which periods and slices are longer than configured.
         in_store_s: processor time in store; negative: borrowed.
         pairs: what each pair takes.

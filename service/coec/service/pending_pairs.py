@@ -1,7 +1,7 @@
 """Awaited pairs, whose configuration leaves out what the bus will tell. The service listens for the missing parts,
 answers for these pairs meanwhile, and hands each over when everything is found.
 
-Used on the daemon's main thread; the thread of `NominalWatch` looks at what is heard.
+Used on the daemon's main thread; the thread of `discovery_listener` reads what is received.
 """
 
 import logging

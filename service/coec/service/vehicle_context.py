@@ -27,7 +27,7 @@ class VehicleContext:
         show: `show(pair, drawn, pose)` reports a pair of frames that is being checked at an extrinsic (4, 4).
         topics: the topics that the vehicle's ROS publishes now.
         nominal: where the nominal calibration of a pair, given by name, comes from; by default its configuration.
-        rig_troubles: in what a pair, given by name, contradicts the vehicle's other pairs.
+        rig_problems: in what a pair, given by name, contradicts the vehicle's other pairs.
         snippets: store for the seconds around an event; None: they are not kept.
     """
 

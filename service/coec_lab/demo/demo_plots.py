@@ -52,7 +52,7 @@ class PlottedSensor:
         kind: `camera` or `lidar`.
         T_ego_sensor: (4, 4) pose in the vehicle (x forward, y left); a camera looks along its z, a LiDAR along its x.
         view_deg: width of its field of view; 360 for a turning LiDAR.
-        state: its health, see `STATE_COLOURS`.
+        state: its health, see `SENSOR_COLOURS`.
         probability: that it has moved; None where that is unknown.
         moved_deg: by how much it has moved, if it has.
     """

@@ -213,7 +213,7 @@ class Screen:
         self._live.stop()
 
     def on_compiling(self, kernel: str) -> None:
-        """Called by `compile_news` when a kernel is being compiled in this process."""
+        """Called by `compilation_events` when a kernel is being compiled in this process."""
         self._news.on_kernel(kernel)
         if self._news.lasted_s >= console.COMPILING_S:
             self._compiling(f"{console.COMPILING}: {self._news.kernels} so far, {self._news.lasted_s:.0f} s")

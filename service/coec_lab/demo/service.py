@@ -128,7 +128,7 @@ ANSWERED_S = 120.0
 
 REST_S = 8.0
 """Idle time after which nothing more comes: twice as long as the rig waits for checks that may be in transit
-(`runtime.rig.keeper.QUIET_TICKS`)."""
+(`service.engine.rig.QUIET_TICKS`)."""
 
 POLL_S = 0.1
 

@@ -10,7 +10,7 @@ drives.
 Checks at one place are not independent: on a highway, if one check is off, the next is off by as much. So hours are
 resampled from whole drives, all of one place for as long as a vehicle stays there. Shuffled checks would be
 independent, and alarms far too few. Resampling cannot show what was never met, so a tail is fitted to the displacements
-of places (`alarm_bound`): once as if every drive were a place of its own, and once as if a vehicle stayed at each place
+of places (`bound`): once as if every drive were a place of its own, and once as if a vehicle stayed at each place
 for ten minutes.
 """
 

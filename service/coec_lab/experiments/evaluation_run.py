@@ -29,8 +29,8 @@ from coec_lab.experiments.solve_experiments import Bench, Stages
 
 MARGIN_DEG, MARGIN_M = 5.0, 0.2
 REACH_MARGIN_DEG, REACH_MARGIN_M = 3.0, 0.15
-"""How far the search box (`MARGIN`) and the reach of the global search (`REACH_MARGIN`) extend beyond the starts at
-least, so that the reference never lies on a bound and a search may overshoot."""
+"""How far the search box (`MARGIN_DEG`) and the reach of the global search (`REACH_MARGIN_DEG`) extend beyond the
+starts at least, so that the reference never lies on a bound and a search may overshoot."""
 
 SIMULATED_TRUTH, OWN_CALIBRATION = "the simulated truth", "the source's own calibration"
 OTHER_HALF = "the other half of the frames"

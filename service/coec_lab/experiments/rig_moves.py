@@ -184,7 +184,8 @@ class NamingResult:
 
 
 def report(drives: int, rigs: int, on_drive: Callable[[str], None]) -> RigMovesReport:
-    """All rows: `drives` drives per fault, and `rigs` rigs whose windows are combined; `heard` hears of each drive."""
+    """All rows: `drives` drives per fault, and `rigs` rigs whose windows are combined; `on_drive` is called for
+    each drive."""
     return RigMovesReport(
         allowed_s=ALLOWED_S,
         moves=tuple(_row(rig, fault, drives, on_drive) for rig, fault in FAULTS),

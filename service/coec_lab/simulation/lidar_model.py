@@ -104,7 +104,7 @@ class Rosette:
     Attributes:
         columns: firings in a sweep.
         beams: number in the upright row.
-        apart_rad: angle between neighbouring beams.
+        spacing_rad: angle between neighbouring beams.
     """
 
     columns: int = 4000

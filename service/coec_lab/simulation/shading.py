@@ -177,7 +177,7 @@ def _lamplit(
 
 
 DAY_HORIZON = 0.5
-"""By day the horizon is brighter than this (`sky.draw_sky`); where it is darker, the skyline is darker, too."""
+"""By day the horizon is brighter than this (`weather.sample_sky`); where it is darker, the skyline is darker, too."""
 LAMP_RADIANCE = 2.0
 """Radiance of a visible lamp: white, twice a wall in full sun."""
 

@@ -97,19 +97,19 @@ class SimulatedOdometer:
         self.hz = wire.hz
 
     def time_s(self, index: int) -> float:
-        """See `Aboard`."""
+        """See `SimulatedSensor`."""
         return index / self.hz
 
     def late_s(self, time_s: float) -> float:  # noqa: ARG002 - never
-        """See `Aboard`."""
+        """See `SimulatedSensor`."""
         return 0.0
 
     def is_lost(self, index: int, time_s: float) -> bool:
-        """See `Aboard`."""
+        """See `SimulatedSensor`."""
         return self._journey.is_odometer_silent(time_s) or self._wire.is_lost(self._journey, index, time_s)
 
     def frame(self, index: int, stamp_ns: int) -> EgoMotion:
-        """See `Aboard`."""
+        """See `SimulatedSensor`."""
         return self._journey.motion(index, self.time_s(index), stamp_ns)
 
 
@@ -142,19 +142,19 @@ class SimulatedLidar:
             self._gains = beam_gains(model.intensity, model.pattern.beams, journey.rng(_GAINS, *wire.key))
 
     def time_s(self, index: int) -> float:
-        """See `Aboard`."""
+        """See `SimulatedSensor`."""
         return index / self.hz + self._delay_s
 
     def late_s(self, time_s: float) -> float:  # noqa: ARG002 - never
-        """See `Aboard`."""
+        """See `SimulatedSensor`."""
         return 0.0
 
     def is_lost(self, index: int, time_s: float) -> bool:
-        """See `Aboard`."""
+        """See `SimulatedSensor`."""
         return self._wire.is_lost(self._journey, index, time_s)
 
     def frame(self, index: int, stamp_ns: int) -> LidarFrame:
-        """See `Aboard`."""
+        """See `SimulatedSensor`."""
         frozen = next(wrong.now(self._wire.faults, wrong.LidarFrozen, self.time_s(index)), None)
         if frozen is None:
             return self._sweep(index, stamp_ns)
@@ -250,19 +250,19 @@ class SimulatedCamera:
         return np.asarray(cv2.erode(np.pad(usable.astype(np.uint8), 2), np.ones((5, 5), np.uint8))[2:-2, 2:-2] > 0)
 
     def time_s(self, index: int) -> float:
-        """See `Aboard`."""
+        """See `SimulatedSensor`."""
         return index / self.hz + self._optics.delay_s
 
     def late_s(self, time_s: float) -> float:
-        """See `Aboard`."""
+        """See `SimulatedSensor`."""
         return late_s(self._wire.faults, time_s)
 
     def is_lost(self, index: int, time_s: float) -> bool:
-        """See `Aboard`."""
+        """See `SimulatedSensor`."""
         return self._wire.is_lost(self._journey, index, time_s)
 
     def frame(self, index: int, stamp_ns: int) -> CameraFrame:
-        """See `Aboard`."""
+        """See `SimulatedSensor`."""
         frozen = next(wrong.now(self._wire.faults, wrong.Frozen, self.time_s(index)), None)
         if frozen is None:
             return self._picture(index, stamp_ns)

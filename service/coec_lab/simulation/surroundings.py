@@ -336,7 +336,7 @@ class Highway:
 
 @dataclass(frozen=True, slots=True)
 class Garage:
-    """The aisle of a parking garage, see `indoors`."""
+    """The aisle of a parking garage, see `garage`."""
 
     seed: int
 
@@ -368,7 +368,7 @@ class Garage:
 
 @dataclass(frozen=True, slots=True)
 class Room:
-    """A row of furnished rooms with people in them, see `indoors`."""
+    """A row of furnished rooms with people in them, see `rooms`."""
 
     seed: int
 

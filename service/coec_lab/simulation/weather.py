@@ -65,7 +65,7 @@ SHOWER_S = 4.0
 SUN_LOW_RAD, SUN_AZIMUTH_RAD = math.radians(5.0), math.radians(8.0)
 """Height of a low sun, and how far to the left of the heading it stands."""
 SUN_POWER = (0.45, 0.75, 1.1)
-"""Light of a low sun: reddish, as in `sky.draw_sky` at its lowest."""
+"""Light of a low sun: reddish, as in `sample_sky` at its lowest."""
 
 
 @dataclass(frozen=True, slots=True)

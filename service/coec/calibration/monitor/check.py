@@ -58,7 +58,7 @@ class Support:
     """How strongly the edges prefer an optimum to the pose at which it was expected.
 
     Attributes:
-        kept: significance at the expected pose over that at the optimum, on the sharpest edges.
+        retained: significance at the expected pose over that at the optimum, on the sharpest edges.
         certainty: of the gain, in standard deviations of the scatter of frames and sectors; see `Landscape`.
     """
 
@@ -135,7 +135,8 @@ class Check:
         edges: significance of the edges at the pose.
         edges_at_best: their significance at the local optimum over rotations.
         edges_in_view: effective number of edges, of all pairs, that lie in the images at that optimum.
-        looks: how many independent looks the pairs are worth over rotations, see `Noise`; 1 if that is unknown.
+        independent_samples: how many independent frames the pairs are worth over rotations, see `Noise`; 1 if that is
+            unknown.
         scatter_rad: (3,) standard deviation of the optimum over rotations from how its pairs and sectors differ, see
             `Noise`; 0 if that is unknown.
         of_rotation, of_pose: how far the edges insist on these optima.
@@ -167,7 +168,7 @@ def gather(data: WindowData, beyond_rad: float = 0.0) -> CheckInput:
     """Prepares the sensors of one pair, each by itself, and joins them.
 
     Args:
-        sight: a window, whose start is the pose that the checks are about.
+        data: a window, whose start is the pose that the checks are about.
         beyond_rad: how far from that pose further poses are to be checked.
 
     Raises:
@@ -197,7 +198,7 @@ def join(
     data: WindowData, sweeps: Sequence[check_edges.PreparedSweep], images: check_edges.PreparedImages, reach_rad: float
 ) -> CheckInput:
     """Joins what was prepared for two sensors into the input of a check of their pair. Sweeps and images are those of
-    the pairs of `sight`, in order. Poses within `reach_rad` of the start of `sight` can be checked."""
+    the pairs of `data`, in order. Poses within `reach_rad` of the start of its window can be checked."""
     window = data.window
     pose = window.T_camera_lidar_start
     project = partial(

@@ -196,7 +196,7 @@ def prepare_images(
         mask: (height, width), False = ignore this pixel; None: all count.
         upright: (2,) direction of the LiDAR's axis in the image, see `EdgeScales`; with several LiDARs, that of any.
         counted: the part of the image in which range edges lie: its mean and deviation are the units of the maps.
-        wanted: the part on which edges are needed; it contains `counted`.
+        required: the part on which edges are needed; it contains `counted`.
 
     Raises:
         CalibrationError: an image is not of the camera's size.

@@ -117,7 +117,7 @@ def explained_by_nuisance(
         edges: the pairs of a check, their sweeps reduced to the range edges of `level`, as measured.
         level: the same range edges, placed, and the edge maps of one level.
         expected: (4, 4) where the local optimum should be.
-        found: (4, 4) where it is, over rotations.
+        rotation_optimum: (4, 4) where it is, over rotations.
         pose_optimum: (4, 4) where it is over all six degrees of freedom: a shifted mount is an explanation, too.
         min_significance: below this nothing is explained.
         zooms: factors on the focal length to try.

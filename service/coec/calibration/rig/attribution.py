@@ -106,7 +106,7 @@ class RigState:
     Attributes:
         histories: of every edge, by name.
         posterior: the last answer to who moved; None before the first look.
-        asked_ns: stamp of the look after which who moved was last asked; a window does not change it.
+        attributed_ns: stamp of the look after which who moved was last asked; a window does not change it.
         stepped_ns: the step in question lies before the looks from this stamp on.
         claimed: the sensors that are probable enough to be named, each with the number of answers in a row that said so
             and knew of a new look at it, `ANSWERS` at most.

@@ -210,7 +210,7 @@ class EdgeHistory:
     Attributes:
         origin: (4, 4) the pose from which offsets are counted.
         information, moment: (6, 6) and (6,) what is known of the offset from before the kept looks.
-        looks: the kept looks in the order of their stamps, `MOST_LOOKS` at most.
+        observations: the kept looks in the order of their stamps, `MAX_OBSERVATIONS` at most.
         origin_sigma: (6,) standard deviation of the origin as windows see it; NaN on axes where that is not known.
         windows: the latest accepted windows, `MOST_WINDOWS` at most, if `origin_sigma` is known; else they are looks.
     """
@@ -307,7 +307,7 @@ class EdgeSteps:
     Attributes:
         xi: (T, 6) the step from where the edge was before to where it is since.
         covariance: (T, 6, 6) of that step.
-        looks: (T,) number of good looks since.
+        observations: (T,) number of good looks since.
         log_transient: (T,) logarithm of the chance that these are bad looks at one place instead.
         log_stepped: (T,) log likelihood of all looks, apart from the factor N(ξ; xi, covariance) of a step of ξ.
         log_still: log likelihood of all looks, bad ones among them, at one place.
@@ -583,7 +583,7 @@ def determined_covariance(covariance: Array) -> Array | None:
 
 
 def observation_of_registration(edge: str, stamp_ns: int, T_a_b: Matrix4, covariance: Array) -> EdgeObservation:
-    """A look at an edge that found `T_a_b` (4, 4); `covariance` (6, 6) is that of `told_by`.
+    """A look at an edge that found `T_a_b` (4, 4); `covariance` (6, 6) is that of the registration.
 
     Raises:
         ValueError: the covariance is invalid.

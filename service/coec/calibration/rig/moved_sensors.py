@@ -8,7 +8,7 @@ integral over x, summed over which edges were disturbed and over how far mounts 
                           · exp(½ · ηᵀ·(P_k⁻¹ + Λ)⁻¹·η)        Λ = Σ Jᵀ·W·J, η = Σ Jᵀ·W·ξ over the other edges
 
 relative to nobody moved and no edge disturbed. A set pays for each axis that it sets free (Occam's factor: MacKay 2003,
-chapter 28), so the fewest moves that explain all steps win. How far a mount moves follows `search.mount_prior`: a
+chapter 28), so the fewest moves that explain all steps win. How far a mount moves follows the prior of mounts: a
 Cauchy density in three dimensions is a mixture of normal ones whose scales are MOUNT_RAD over the modulus of a standard
 normal variable; a few quantiles stand for all scales.
 
@@ -101,7 +101,7 @@ class MovePosterior:
         disturbed: probability that something other than a sensor lastingly disturbs an edge, by name.
         steps: by how much each sensor in the likeliest set moved, by name.
         when: index of the likeliest time.
-        looked_at: edges that were looked at since.
+        observed: edges that were looked at since.
     """
 
     nobody: float

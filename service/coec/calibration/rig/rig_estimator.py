@@ -117,7 +117,7 @@ class VehicleRig:
         sensors: what is believed of each sensor, in the order of names.
         since_ns: since when each sensor is in its state, by name.
         correction: the latest correction.
-        looks: number of looks counted, by edge.
+        observations: number of looks counted, by edge.
         registered: the latest look at two LiDARs, by edge, whether or not another one agreed with it.
     """
 

@@ -197,7 +197,7 @@ class CachedDepth:
 def open_depth(config: DepthConfig, limits: LimitsConfig) -> DepthModel:
     """The depth model that a configuration names: `stereo`, an ONNX file, or the name of a built-in card.
 
-    The file of a built-in card is searched at `network_files.places_of`.
+    The file of a built-in card is searched where `coec models` puts it.
 
     Raises:
         ModelError: no such file or name, no card for it, a damaged network, or one that does not match its

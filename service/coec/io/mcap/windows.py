@@ -137,7 +137,7 @@ class WindowContent:
     Attributes:
         attachments: by name.
         metadata: what the window is.
-        kept: which other window it holds pairs of; empty: none.
+        carried_over: which other window it holds pairs of; empty: none.
     """
 
     attachments: dict[str, bytes] = field(default_factory=dict)

@@ -600,8 +600,8 @@ def write_bag(
     Args:
         T_camera_lidar: (4, 4), the transform in `/tf_static`.
         frames: in the order in which they are written; depth maps are left out.
-        heard: called after each frame.
-        beside: further messages (topic, type, CDR) to write at the stamp of a frame.
+        on_frame: called after each frame.
+        extra_messages: further messages (topic, type, CDR) to write at the stamp of a frame.
 
     Raises:
         OSError: the file cannot be written.

@@ -78,7 +78,7 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
       (default: `odom` and `base_link`), else the rotation from an IMU. If `/tf_static` does not lead to the frame of
       the motion, the motion is left out; `odometry_frame` names another frame for it.
     - `time` says how points are timed, if their values leave it open (see `config.PointTimeConfig`).
-    - `lidar_source` chooses one LiDAR of a cloud of several (see `adapters.ros.source_field`).
+    - `lidar_source` chooses one LiDAR of a cloud of several (see `io.ros.point_clouds.SOURCE_FIELDS`).
     - `metadata` describes the LiDAR whose packets are read, if the bag does not, or has several.
 
     Raises:

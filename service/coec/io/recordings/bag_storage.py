@@ -103,13 +103,13 @@ _NO_CHUNK = -1
 
 @dataclass(frozen=True, slots=True)
 class McapStorage:
-    """The `Storage` of an MCAP file. A place is: file offset of the chunk (-1 outside chunks), offset in the chunk,
+    """The `BagStorage` of an MCAP file. A place is: file offset of the chunk (-1 outside chunks), offset in the chunk,
     length; and the number of the translation of a message that is not in CDR."""
 
     path: Path
 
     def entries(self) -> Iterator[BagMessage]:
-        """See `Storage`."""
+        """See `BagStorage`."""
         schemas: dict[int, mcap_reader.Schema] = {}
         channels: dict[int, mcap_reader.Channel] = {}
         try:
@@ -151,7 +151,7 @@ class McapStorage:
 
     @contextmanager
     def open(self) -> Iterator[BagReader]:
-        """See `Storage`."""
+        """See `BagStorage`."""
         with self.path.open("rb") as stream:
             yield _McapReader(self.path, mcap_reader.MessageReader(stream))
 
@@ -162,7 +162,7 @@ class _McapReader:
     reader: mcap_reader.MessageReader
 
     def read(self, place: tuple[int, ...]) -> bytes:
-        """See `Reader`."""
+        """See `BagReader`."""
         chunk_at, at, length, *number = place
         try:
             data = self.reader.read(None if chunk_at == _NO_CHUNK else chunk_at, at, length)
@@ -213,12 +213,12 @@ _TABLES = {"topics", "messages"}
 
 @dataclass(frozen=True, slots=True)
 class SqliteStorage:
-    """The `Storage` of a SQLite file. A place is the row of a message."""
+    """The `BagStorage` of a SQLite file. A place is the row of a message."""
 
     path: Path
 
     def entries(self) -> Iterator[BagMessage]:
-        """See `Storage`."""
+        """See `BagStorage`."""
         with self._connected() as connection:
             topics = self._topics(connection)
             left = self.path.stat().st_size
@@ -239,7 +239,7 @@ class SqliteStorage:
 
     @contextmanager
     def open(self) -> Iterator[BagReader]:
-        """See `Storage`."""
+        """See `BagStorage`."""
         with self._connected() as connection:
             yield _SqliteReader(self, connection)
 
@@ -296,7 +296,7 @@ class _SqliteReader:
     connection: sqlite3.Connection
 
     def read(self, place: tuple[int, ...]) -> bytes:
-        """See `Reader`."""
+        """See `BagReader`."""
         return self.storage.read_from(self.connection, place[0])
 
 
@@ -370,13 +370,13 @@ def _fields(header: bytes, place: int) -> dict[bytes, bytes]:
 
 @dataclass(frozen=True, slots=True)
 class Ros1Storage:
-    """The `Storage` of a bag of ROS 1. A place is: offset of the chunk (-1 outside chunks), offset in it, length,
+    """The `BagStorage` of a bag of ROS 1. A place is: offset of the chunk (-1 outside chunks), offset in it, length,
     number of the translation."""
 
     path: Path
 
     def entries(self) -> Iterator[BagMessage]:
-        """See `Storage`. Messages of types that are no longer in ROS 2 are left out."""
+        """See `BagStorage`. Messages of types that are no longer in ROS 2 are left out."""
         connections: dict[int, tuple[str, int]] = {}
         try:
             with self.path.open("rb") as stream:
@@ -414,7 +414,7 @@ class Ros1Storage:
 
     @contextmanager
     def open(self) -> Iterator[BagReader]:
-        """See `Storage`."""
+        """See `BagStorage`."""
         with self.path.open("rb") as stream:
             yield _Ros1Reader(self.path, stream)
 
@@ -493,7 +493,7 @@ class _Ros1Reader:
     chunk: bytes = field(default=b"", repr=False)
 
     def read(self, place: tuple[int, ...]) -> bytes:
-        """See `Reader`."""
+        """See `BagReader`."""
         chunk_at, at, length, number = place
         if chunk_at == _NO_CHUNK:
             self.stream.seek(at)
@@ -561,7 +561,7 @@ class BagInformation(BaseModel):
 
 @dataclass(frozen=True, slots=True, weakref_slot=True)
 class FolderStorage:
-    """The `Storage` of a folder. A place is: number of the file, place in that file.
+    """The `BagStorage` of a folder. A place is: number of the file, place in that file.
 
     Attributes:
         packed_messages: whether each message is a zstd frame (`compression_mode: MESSAGE`).
@@ -572,7 +572,7 @@ class FolderStorage:
     packed_messages: bool
 
     def entries(self) -> Iterator[BagMessage]:
-        """See `Storage`."""
+        """See `BagStorage`."""
         for number, file in enumerate(self.files):
             left = MAX_UNPACKED_MESSAGE_BYTES
             for entry in file.entries():
@@ -584,7 +584,7 @@ class FolderStorage:
 
     @contextmanager
     def open(self) -> Iterator[BagReader]:
-        """See `Storage`."""
+        """See `BagStorage`."""
         with ExitStack() as opened:
             yield _FolderReader(self, opened, {})
 
@@ -613,7 +613,7 @@ class _FolderReader:
     current: dict[int, BagReader]
 
     def read(self, place: tuple[int, ...]) -> bytes:
-        """See `Reader`."""
+        """See `BagReader`."""
         number, *rest = place
         if number not in self.current:
             self.opened.close()

@@ -64,8 +64,8 @@ def load_window(
     between_s: tuple[float, float] = WHOLE,
 ) -> LoadedWindow:
     """The window of a SOURCE. A recorded window's file gives its own window. From any other recording, at most `frames`
-    (`default_frames` if None) camera frames are chosen evenly and paired. `heard(done, total)` counts camera frames.
-    Only camera frames from `between_s` (begin, end) seconds after the first one are used.
+    (`default_frames` if None) camera frames are chosen evenly and paired. `on_progress(done, total)` counts camera
+    frames. Only camera frames from `between_s` (begin, end) seconds after the first one are used.
 
     Raises:
         UsageError, SourceError, WindowError: see `open_source`. SourceError also if no camera frame has a sweep.
@@ -88,8 +88,8 @@ def window_of_recording(
     on_progress: Callable[[int, int], None],
     between_s: tuple[float, float] = WHOLE,
 ) -> LoadedWindow:
-    """The window of an open recording: at most `frames` of its camera frames, evenly chosen and paired. `heard` and
-    `between_s` as in `load`. The recording's own extrinsic counts as one in use, not as a guess.
+    """The window of an open recording: at most `frames` of its camera frames, evenly chosen and paired. `on_progress`
+    and `between_s` as in `load`. The recording's own extrinsic counts as one in use, not as a guess.
 
     Raises:
         SourceError: a file cannot be read, or no camera frame has a sweep.

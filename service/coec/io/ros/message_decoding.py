@@ -357,7 +357,7 @@ def decode(
 
     Stamp and frame id are those of the header, except for an odometry, whose frame id is that of the child frame, in
     which its twist is expressed. CDR has no sequence number. `point_time` says how points are timed if their values do
-    not show it; `source` is the requested LiDAR in a cloud of several (see `of_source`).
+    not show it; `source` is the requested LiDAR in a cloud of several (see `point_clouds.points_of_source`).
 
     Raises:
         DecodeError: any other message, with a reason of `Refusal`.

@@ -348,7 +348,7 @@ class PlacedFrame:
 
 
 def encode_transforms(frames: Sequence[PlacedFrame], stamp_ns: int) -> bytes:
-    """`TFMessage`. Like `Placed`, transforms of tf map coordinates of the child to those of the parent."""
+    """`TFMessage`. Like `PlacedFrame`, transforms of tf map coordinates of the child to those of the parent."""
     transforms = []
     for frame in frames:
         x, y, z, w = (float(v) for v in quaternion_xyzw_from_rotation(frame.T_parent_child[:3, :3]))

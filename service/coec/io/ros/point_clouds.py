@@ -153,7 +153,7 @@ def offsets_s(
         name: of the field.
         column: (N,) its values.
         keep: (N,) the points whose values count, None: all; other values may be anything.
-        said: how to read it, if the configuration says so.
+        configured: how to read it, if the configuration says so.
 
     Raises:
         DecodeError: `cloud_time` if no reading brings the points near the stamp, `cloud_time_ambiguous` if several do.
@@ -429,9 +429,9 @@ def frame_of(
     """The sweep of a message whose header is already checked.
 
     `x y z` may be float32 or float64; `intensity` any number; `ring` (or `channel`, `line`) an unsigned integer. The
-    time is one of `TIME_FIELDS`, any number, read as recognised in `point_time` or as the argument `point_time` says.
+    time is one of `FIELDS`, any number, read as recognised in `point_time` or as the argument `point_time` says.
     Optional fields of other types are left out, and so are fields with several values per point. A `stamp_ns` of 0
-    means no stamp; then the first point gives it, if it has a time of day. `source`: see `of_source`.
+    means no stamp; then the first point gives it, if it has a time of day. `source`: see `points_of_source`.
 
     Raises:
         DecodeError: `cloud_shape`, `cloud_fields`, `cloud_too_large`, `cloud_empty`, `cloud_time`,

@@ -155,7 +155,7 @@ class StaticTransforms:
         """Add these joints; they replace earlier joints between the same frames.
 
         Raises:
-            DecodeError: there would be more than `MAX_JOINTS`; then none is added.
+            DecodeError: there would be more than `MAX_STATIC_TRANSFORMS`; then none is added.
         """
         known = {(joint.child, joint.parent) for parents in self._joints.values() for joint in parents.values()}
         fresh = {(joint.child, joint.parent) for joint in joints} - known

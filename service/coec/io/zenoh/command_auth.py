@@ -162,7 +162,7 @@ class CommandListener:
 
         Raises:
             NotProvenError: the speaker cannot prove its name, or took too long.
-            CrowdedError: the conversation would begin, but there is no room.
+            TooManyHandshakesError: the conversation would begin, but there is no room.
         """
         now_s = self._clock()
         while self._pending and next(iter(self._pending.values()))[1] < now_s:

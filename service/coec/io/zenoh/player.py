@@ -67,7 +67,7 @@ def paced(
         rate: multiple of the recorded speed.
         stop: ends the playing before the next item.
         send: publishes an item and returns its stream and number of bytes.
-        heard: called after each item.
+        on_sent: called after each item.
         played: counters to go on with; also returned.
     """
     start_s = time.monotonic()

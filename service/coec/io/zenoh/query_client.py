@@ -529,14 +529,14 @@ def fetch_window(
     Args:
         timeout_s: for one answer.
         patience_s: time without any new piece after which to give up.
-        heard: called with the number of bytes that are there, and the total.
+        on_progress: called with the number of bytes that are there, and the total.
         max_bytes: largest size that the vehicle may claim; nothing is fetched of a larger one.
         replaces: whether a file of another content may be replaced. An earlier version of the window is one.
 
     Raises:
         NotFoundError: nobody answered.
         RemoteError: there is no such window, it is larger than `max_bytes`, or its bytes do not have the promised hash.
-        NoRoomError: the disk has no room for it.
+        NoSpaceError: the disk has no room for it.
         OutputError: the file cannot be written. The received part stays for the next attempt. Or it holds something
             else, and must not be replaced.
     """

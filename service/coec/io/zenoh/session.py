@@ -96,7 +96,7 @@ class Endpoint:
         """Whether a program on another computer gets in without a certificate if a session listens on this endpoint.
 
         Args:
-            certificates_asked: whether clients need a certificate if the endpoint itself does not say.
+            certificates_required: whether clients need a certificate if the endpoint itself does not say.
         """
         if self.on_loopback:
             return False

@@ -34,7 +34,7 @@ class Authority:
     """Decides who may command a vehicle."""
 
     def __init__(self, config: AuthorityConfig, external_access: Callable[[], str | None]) -> None:
-        """`reached_from_outside()` says in a clause why programs on other computers can reach the service; None: they
+        """`external_access()` says in a clause why programs on other computers can reach the service; None: they
         cannot."""
         self._config = config
         self._allowed = {sender.name: frozenset(sender.commands) for sender in config.senders}

@@ -56,7 +56,7 @@ class MetricsInput:
         status: status of the service.
         health: health of each pair.
         memory_bytes, worker_memory_bytes: resident memory of the service and of its worker.
-        took: durations, by the name of their family.
+        durations: durations, by the name of their family.
         rig: what all pairs say together.
         uplink: counts of the evidence that went out.
     """
@@ -72,7 +72,7 @@ class MetricsInput:
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """One metric family. `samples` is empty for histograms, whose figures are in `View.took`."""
+    """One metric family. `samples` is empty for histograms, whose figures are in `MetricsInput.durations`."""
 
     name: str
     kind: Kind
@@ -299,7 +299,7 @@ def _escaped(label: str) -> str:
 
 QUERY, DECODE, PAIR_WAIT = "coec_query_seconds", "coec_decode_seconds", "coec_pair_wait_seconds"
 WRITE, JOB, WORK = "coec_write_seconds", "coec_worker_job_seconds", "coec_worker_work_seconds"
-"""Names of the histograms; the keys of `View.took`."""
+"""Names of the histograms; the keys of `MetricsInput.durations`."""
 
 FAMILIES: tuple[Family, ...] = (
     Family("coec_build", "info", "Version of the service.", ("version",), lambda view: (((view.status.version,), 1),)),

@@ -194,7 +194,7 @@ class MetricsServer:
 
     Attributes:
         server: the present server; None if there is none.
-        trouble: why there is no server although there should be one; else None. It does not affect calibrations.
+        problem: why there is no server although there should be one; else None. It does not affect calibrations.
         insecure: the reason to report if other computers can reach the server; else None.
     """
 

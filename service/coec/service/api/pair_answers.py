@@ -100,7 +100,7 @@ class Overlays:
         """JPEG of a window with its points drawn at an extrinsic (4, 4); waits for the worker.
 
         Raises:
-            NotDrawnError: the picture did not come.
+            OverlayUnavailableError: the picture did not come.
         """
         key = (path.stem, T_camera_lidar.tobytes())
         with self._lock:
@@ -364,7 +364,7 @@ class PairAnswers:
 
         Raises:
             NotFoundError: no such window.
-            NotDrawnError: the worker has no time for it, or cannot draw it.
+            OverlayUnavailableError: the worker has no time for it, or cannot draw it.
         """
         latest = self._recorder.latest
         if window_id is None and (latest is None or not latest.exists()):

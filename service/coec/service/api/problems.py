@@ -362,7 +362,7 @@ class RouterMonitor:
     """For one thread.
 
     Attributes:
-        trouble: the reason while there is no router; None while there is one.
+        problem: the reason while there is no router; None while there is one.
     """
 
     def __init__(

@@ -180,7 +180,7 @@ def health_of(
 
     Args:
         losses: losses of the pair, by place and cause.
-        troubles: troubles of the whole service, of the pair's streams, or of its recorder.
+        problems: troubles of the whole service, of the pair's streams, or of its recorder.
         missed: sentences about streams that nobody sends.
     """
     latest = known.state.latest

@@ -197,10 +197,10 @@ class LidarState(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """The result of a look at two LiDARs a and b.
+    """The result of a registration of two LiDARs a and b.
 
     Attributes:
-        look: the pose of b in a, as evidence of which sensor moved.
+        observation: the pose of b in a, as evidence of which sensor moved.
         window: the same for the joint estimate.
         range_bias: by how much b measures longer ranges than a.
         rms_m: distance of the points of b from the surfaces of a.
@@ -217,13 +217,13 @@ class Registration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LidarPairReport:
-    """The outcome of a look, or of the sweeps that should have given one.
+    """The outcome of a registration, or of the sweeps that should have given one.
 
     Attributes:
-        stamp_ns: stamp of the last sweep of the look.
-        told: the result; None if the look was refused.
+        stamp_ns: stamp of the last sweep of the registration.
+        registration: the result; None if the registration was refused.
         reasons: why it was refused; empty exactly if it was not.
-        losses: number of sweeps and looks that were lost so far, by cause.
+        losses: number of sweeps and registrations that were lost so far, by cause.
     """
 
     stamp_ns: int
@@ -240,10 +240,10 @@ class LidarPairStatus:
         edge: the two LiDARs and their pose as built.
         state: see `LidarState`.
         reasons: reasons for the state; empty if they are measured.
-        stamp_ns: stamp of the latest look that was done or refused; None before the first.
-        told: result of the latest look that was not refused.
-        looks: number of looks that had a result.
-        losses: see `LidarsSaid`.
+        stamp_ns: stamp of the latest registration that was done or refused; None before the first.
+        registration: result of the latest one that was not refused.
+        registrations: number of registrations that had a result.
+        losses: see `LidarPairReport`.
     """
 
     edge: Edge

@@ -42,7 +42,7 @@ class _Reading:
     """The file that is being read. It stays open, even if another file takes its name.
 
     Attributes:
-        begun: status of the file at the beginning.
+        initial_status: status of the file at the beginning.
     """
 
     path: Path

@@ -286,7 +286,7 @@ class PairStore:
         self._disk_writer.write(self.history, self.incidents, self._store)
 
     def is_on_disk(self) -> bool:
-        """Whether all that was noted and saved before this call is on the disk; see `Scribe.has_written`."""
+        """Whether all that was noted and saved before this call is on the disk; see `DiskWriter.has_written`."""
         return self._disk_writer.has_written()
 
     def may_be_published(self) -> bool:

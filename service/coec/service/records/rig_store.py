@@ -242,7 +242,7 @@ class RigBaseline:
     """Belongs to the thread of the engine; `flush` is for the disk writer.
 
     Attributes:
-        trouble: why an existing baseline is not used; else None.
+        problem: why an existing baseline is not used; else None.
     """
 
     def __init__(self, pair: PairConfig, rig: Rig, state: StateConfig) -> None:

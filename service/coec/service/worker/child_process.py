@@ -83,7 +83,7 @@ class Link:
         """The next message, of at most `max_bytes`; blocks until it is there.
 
         Raises:
-            NoMessageError: what came is too large, not msgpack, or no map.
+            MalformedMessageError: what came is too large, not msgpack, or no map.
             OSError, EOFError: the other end is gone, or stopped in the middle of a message.
         """
         unpacker = msgpack.Unpacker(max_buffer_size=max_bytes)
@@ -254,7 +254,7 @@ class Child:
         return self._link.poll(within_s)
 
     def receive(self) -> dict[str, Any]:
-        """The next message of the process; to be called when it `has_spoken`.
+        """The next message of the process; to be called when it `has_message`.
 
         Raises:
             ChildError: the process has ended or stopped in the middle, or what came is no message.

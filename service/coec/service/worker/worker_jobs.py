@@ -329,14 +329,14 @@ def check(
 
 
 def overlay(pair: str, path: Path, pose: Matrix4, title: str, done: Done, deadline_s: float | None = None) -> WorkerJob:
-    """Draws the last pair of a window's file at an extrinsic (4, 4); answered with `Drawn`."""
+    """Draws the last pair of a window's file at an extrinsic (4, 4); answered with `RenderedImage`."""
     body = {"path": str(path), "pose": pose.tolist(), "title": title}
     return WorkerJob(Kind.OVERLAY, pair, path.stem, body, done, deadline_s=deadline_s)
 
 
 def comparison(pair: str, path: Path, poses: tuple[Matrix4, Matrix4], names: tuple[str, str], done: Done) -> WorkerJob:
     """Draws a window's file at two extrinsics (4, 4), where they differ most; `names` are their captions. Answered with
-    `Drawn`."""
+    `RenderedImage`."""
     body = {"path": str(path), "poses": [pose.tolist() for pose in poses], "names": list(names)}
     return WorkerJob(Kind.OVERLAY, pair, path.stem, body, done)
 
@@ -344,7 +344,7 @@ def comparison(pair: str, path: Path, poses: tuple[Matrix4, Matrix4], names: tup
 def picture(
     pair: str, configuration: CalibrationConfig, pose: Matrix4, frame_pair: FramePair, title: str, done: Done
 ) -> WorkerJob:
-    """Draws a pair of the stream at an extrinsic (4, 4); answered with `Drawn`."""
+    """Draws a pair of the stream at an extrinsic (4, 4); answered with `RenderedImage`."""
     body = {
         "configuration": configuration.model_dump(mode="json"),
         "pose": pose.tolist(),

@@ -1,7 +1,7 @@
 """The worker process: infers depth and solves windows, one job at a time, for the service that started it.
 
-Started as `python -m coec.service.worker.worker_main SOCKET PARENT`; see `link` for the wire. It dies with its parent,
-ignores the signals that are meant for the service, and answers every question under its number: see `dispatch`.
+Started as `python -m coec.service.worker.worker_main SOCKET PARENT`; see `child_process` for the wire. It dies with its
+parent, ignores the signals that are meant for the service, and answers every question under its number.
 """
 
 import contextlib
