@@ -61,6 +61,7 @@ KINDS = {
     TF: "tf2_msgs/msg/TFMessage",
 }
 OK, ERROR, STALE = 0, 2, 3
+CORRECTED_DEG = 0.5
 
 
 @pytest.fixture(scope="module")
@@ -195,7 +196,17 @@ def test_a_vehicle_of_another_client(python: Path, tmp_path: Path, drive: Drive,
             running.rest()
             settled = list(ros.levels())
             running.send_by(ros.send, after)
-            wait_until(lambda: ERROR in ros.levels()[len(settled) :], "the knock", PATIENCE_S)
+            # On a busy machine the window that corrects the knock may end with the check that notices it. Then the pair
+            # is miscalibrated for less than the time between two messages.
+            wait_until(
+                lambda: (
+                    ERROR in ros.levels()[len(settled) :]
+                    or drive.error_deg(running.extrinsic(), SECONDS) < CORRECTED_DEG
+                ),
+                "the knock",
+                PATIENCE_S,
+            )
+            assert "miscalibrated" in [entry["code"] for entry in running.entries("state")]
             wait_until(lambda: bool(ros.got("/coec/front/overlay/compressed")), "the picture", PATIENCE_S)
             wait_until(lambda: bool(ros.got("/coec/front/camera/camera_info")), "the intrinsics", PATIENCE_S)
             assert all(one["jpeg"] for one in ros.got("/coec/front/overlay/compressed"))

@@ -48,7 +48,7 @@ def test_the_text_report_time_difference_spread_and_network() -> None:
     assert lines[0].startswith("front, 2020-09-13 12:26:40.123Z: start and accepted are 0.50° and 0.0 cm apart")
     assert lines[1] == "accepted − start: pitch +0.00 ± 0.02°, yaw −0.50 ± 0.03°, roll +0.00 ± 0.04°"
     assert lines[2] == "depth network: tiny.onnx"
-    assert any(line.startswith("σ: standard deviation to which accepted is known") for line in lines)
+    assert any(line.startswith("σ: standard deviation of accepted") for line in lines)
 
 
 def test_the_spread_of_a_part_is_that_of_its_range_edges() -> None:
