@@ -1,6 +1,7 @@
 """Equation (2): each limit fails on its own, and a figure that could not be computed never passes."""
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -31,10 +32,11 @@ from coec.calibration.verdict import (
     intrinsics_metric,
     judge,
     on_the_sharpest,
+    optimum_metrics,
     repetition_metric,
     shape_metrics,
 )
-from coec.config import VerdictConfig
+from coec.config import CalibrationConfig, SearchConfig, VerdictConfig
 from coec.geometry import se3
 
 LIMITS = VerdictConfig()
@@ -191,13 +193,27 @@ def test_an_objective_without_edges_has_none_to_count_once() -> None:
     assert repetition_metric(None, LIMITS) == ()
 
 
+def assessed(samples: float = np.nan, significance: float = 20.0, rivals: tuple[float, ...] = ()) -> AssessedOptimum:
+    uncertainty = replace(Uncertainty.unknown(), independent_samples=samples)
+    search, posterior = SearchResult(np.eye(4), 10, TOLERANCE), posterior_of(significance=significance, nominal=1.0)
+    return AssessedOptimum(search, (), PEAK, posterior, None, rivals, uncertainty, SHARP)
+
+
+@pytest.mark.parametrize(
+    ("dof", "frames", "samples", "stricter"),
+    [(3, 1, 1.0, True), (3, 10, 2.5, True), (3, 10, 8.0, False), (3, 10, np.nan, False), (6, 10, 2.5, False)],
+)
+def test_a_rotation_from_one_scene_needs_more_contrast(
+    dof: Literal[3, 6], frames: int, samples: float, stricter: bool
+) -> None:
+    config = CalibrationConfig(search=SearchConfig(dof=dof))
+    contrast, *_ = optimum_metrics(OUTSTANDING, GOOD, None, assessed(samples), None, frames, config)
+    assert (contrast.name, contrast.limit > LIMITS.min_edge_contrast) == ("edge_contrast", stricter)
+
+
 def on_sharp(significance: float, rivals: tuple[float, ...] = (), runner: float = 0.95) -> dict[str, float]:
     """Edge contrast and runner-up on blurred and sharp edges; 4 of contrast at the optimum itself."""
-    unknown = Uncertainty.unknown()
-    search = SearchResult(np.eye(4), 10, TOLERANCE)
-    optimum = AssessedOptimum(
-        search, (), PEAK, posterior_of(significance=significance, nominal=1.0), None, rivals, unknown, SHARP
-    )
+    optimum = assessed(significance=significance, rivals=rivals)
     blurred = (OUTSTANDING[0], replace(OUTSTANDING[1], value=runner))
     evaluation = replace(GOOD, edge_contrast=4.0)
     return {m.name: m.value for m in on_the_sharpest(blurred, evaluation, Scale(mean=1.0, deviation=2.0), optimum)}

@@ -48,7 +48,7 @@ def estimate_of(result: EstimatorResult, data: WindowData, config: CalibrationCo
     evaluation = result.objective.evaluate(pose)
     change = None if result.edges is None else change_point(result.edges, pose)
     metrics = verdict.optimum_metrics(
-        result.metrics, evaluation, result.edge_scale, optimum, change, window.pairs, config
+        result.metrics, evaluation, result.edge_scale, optimum, change, len(window.pairs), config
     )
     moved = None
     if result.edges is not None and change is not None and any(m.name == MOVED and not m.passed for m in metrics):

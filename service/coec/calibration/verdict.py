@@ -7,7 +7,7 @@ Each figure compares the window with itself. So one set of limits serves any sce
 rig is commissioned. `estimate_lens` reports what the window shows of the lens.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from math import degrees, hypot, inf, isfinite, isnan, radians, sqrt
 from types import MappingProxyType
@@ -25,7 +25,6 @@ from coec.calibration.types import (
     INTRINSICS_OFF,
     MOVED,
     Decision,
-    FramePair,
     LensEstimate,
     Metric,
     MovedWithin,
@@ -63,8 +62,8 @@ _CONTRADICTED = {posterior.CENTRE_OFF: "the held centre", posterior.CLOCKS_OFF: 
 CAUSES = frozenset({INTRINSICS_OFF, MOVED})
 """Codes of reasons that explain the others: they are named first."""
 
-SINGLE_FRAME = 1.2
-"""Edge contrast that a single frame has to have, over that of a window. See docs/measured.md."""
+ONE_SCENE_CONTRAST = 1.2
+"""Edge contrast that a window of one scene has to have, over that of other windows. See docs/measured.md."""
 
 EVEN_CERTAINTY = 1.5
 """Certainty at which the intrinsics are as likely off as right: three standard deviations, each half a unit."""
@@ -162,8 +161,8 @@ def on_the_sharpest(
     return tuple(replace(m, value=min(m.value, sharp.get(m.name, m.value))) for m in metrics)
 
 
-def _of_a_single_frame(metric: Metric) -> Metric:
-    return replace(metric, limit=SINGLE_FRAME * metric.limit) if metric.name == EDGE_CONTRAST else metric
+def _of_one_scene(metric: Metric) -> Metric:
+    return replace(metric, limit=ONE_SCENE_CONTRAST * metric.limit) if metric.name == EDGE_CONTRAST else metric
 
 
 def optimum_metrics(
@@ -172,21 +171,22 @@ def optimum_metrics(
     scale: Scale | None,
     optimum: AssessedOptimum,
     change: ChangePoint | None,
-    pairs: Sequence[FramePair],
+    frames: int,
     config: CalibrationConfig,
 ) -> tuple[Metric, ...]:
     """All metrics of an optimum: those of its objective, of its shape, of its edges, and of a change within the window.
-    `evaluation` is that of the objective at the optimum, `scale` that of its edges.
+    `evaluation` is that of the objective at the optimum, `scale` that of its edges, `frames` the number of pairs.
 
     If translation is searched, what all frames have in common has to fit by itself: a shift fits one near object, or
-    lines along the road. A single frame has nothing else, so its edge contrast has to be larger.
+    lines along the road. If not, the edge contrast of one scene, as of a single frame, has to be larger.
     """
     limits = config.verdict
-    counted = counted_once(of_objective, optimum.uncertainty.independent_samples, len(pairs))
+    counted = counted_once(of_objective, optimum.uncertainty.independent_samples, frames)
     of_edges = on_the_sharpest(counted, evaluation, scale, optimum)
     repeats = config.search.dof == 6
+    one_scene = frames == 1 or saw_one_scene(optimum.uncertainty.independent_samples, frames)
     return (
-        *(of_edges if repeats or len(pairs) > 1 else (_of_a_single_frame(metric) for metric in of_edges)),
+        *(map(_of_one_scene, of_edges) if one_scene and not repeats else of_edges),
         *shape_metrics(evaluation, optimum.curvature, optimum.sigma, limits),
         *(repetition_metric(optimum.independent, limits) if repeats else ()),
         *intrinsics_metric(optimum.posterior, limits),

@@ -16,7 +16,7 @@ from coec.calibration.objective.edges import EdgeCue, in_reach
 from coec.calibration.objective.mutual_information import SearchBox
 from coec.calibration.types import Matrix4
 from coec.geometry import se3
-from coec.geometry.edges.alignment import AscentStart, EdgeFrames, ascend, significances
+from coec.geometry.edges.alignment import AscentStart, EdgeFrames, Summit, ascend, significances
 from coec.geometry.edges.charts import (
     EdgeCharts,
     charted_significances,
@@ -188,6 +188,9 @@ SUMMIT_LEADING_RAD = (radians(0.4), radians(0.2), radians(0.1))
 SUMMIT_STEPS_RAD = (radians(0.2), radians(0.1), radians(0.05), radians(0.025))
 """Steps of the climbs from there: on the finest band, and then on the sharpest edges."""
 
+SAME_SUMMIT_RAD = radians(0.1)
+"""Climbs that come as near to each other go on as one. See docs/measured.md."""
+
 SUMMIT_REACH = SearchBox(radians(5.0), 0.5)
 """How far these climbs may lead."""
 
@@ -230,15 +233,28 @@ def highest_summit(edges: EdgeCue, pose: Matrix4, held_m: float | None) -> Matri
         starts = [pose, *(se3.perturb(pose, turn) for turn in turned)]
         if not turns_only:
             starts.extend(other for turn in SUMMIT_SPACING_RAD for other in shifted(pose[None], near_m * turn, near_m))
-        led = ascend(band, [AscentStart(start, 0, len(few.maps)) for start in starts], of_band)
-        ascents = ascend(few, [AscentStart(end.pose, 0, len(few.maps)) for end in led], of_sharp)
-        ends = np.array([ascent.pose for ascent in ascents])
+        ends = np.array(starts)
+        for frames, moves in ((band, of_band[:1]), (band, of_band[1:]), (few, of_sharp)):
+            ends = _different(ascend(frames, [AscentStart(end, 0, len(frames.maps)) for end in ends], moves), near_m)
         z = significances(seen, ends)
         best = int(np.argmax(z))
         if z[best] <= highest + (TURNED_MARGIN if turns_only else SUMMIT_MARGIN):
             break
         pose, highest = ends[best], float(z[best])
     return pose
+
+
+def _different(summits: list[Summit], near_m: float) -> NDArray[np.float64]:
+    """(n, 4, 4) the poses of some summits, the highest of those that lie within `SAME_SUMMIT_RAD`."""
+    poses = np.array([summit.pose for summit in sorted(summits, key=lambda summit: -summit.score)])
+    offsets = poses[:, None, :3] - poses[:, :3]
+    # A small turn by an angle changes a rotation matrix by √2 of it (Frobenius).
+    turns_rad = np.sqrt(0.5 * np.sum(offsets[..., :3] ** 2, axis=(2, 3)))
+    shifts_rad = np.sqrt(np.sum(offsets[..., 3] ** 2, axis=2)) / near_m
+    same, retained = np.maximum(turns_rad, shifts_rad) <= SAME_SUMMIT_RAD, np.zeros(len(poses), np.bool_)
+    for k in range(len(poses)):
+        retained[k] = not (same[k] & retained).any()
+    return poses[retained]
 
 
 def sample_reach(start: Matrix4, reach: SearchBox, count: int) -> NDArray[np.float64]:

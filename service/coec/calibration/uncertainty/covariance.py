@@ -290,12 +290,14 @@ def _assessed(
     if edges is None:
         uncertainty = _scattered(objective, pose, moved, window, config.verdict.held_translation_sigma_m)
     else:
-        independent = independent_samples_at(edges.sharp, pose)
         limits, fitted_px = config.verdict, lens_error_px(window.rig.camera_residual_px)
         lens = hypot(limits.principal_point_sigma * window.rig.camera.width, fitted_px), limits.focal_length_sigma
         assumed = Assumptions(edges.to_the_sharpest, window, held, held_to_m, lens)
         posterior = measure_posterior(assumed, pose)
         rivals = tuple(significance_next_to(assumed, rival) for rival in result.rivals)
+        # A held centre that is a little off displaces most edges of a near scene, and what frames share with them.
+        likely = pose if posterior is None else se3.perturb(pose, posterior.hypotheses[0].deviation[:6])
+        independent = independent_samples_at(edges.sharp, likely)
         if posterior is not None:
             uncertainty = _posterior_uncertainty(posterior, objective, pose, moved, window, independent.count)
             search = replace(search, T_camera_lidar=se3.perturb(pose, posterior.step(moved)))

@@ -52,6 +52,10 @@ MEMORY, SETTLED = 4.0, 12
 """How fast steps shrink: step t after the whole ones counts `MEMORY` / (t + `MEMORY`), so that the first are forgotten;
 from `SETTLED` on half as much memory averages more. See docs/measured.md."""
 
+WIDE_START = 3.0
+"""Standard deviations at the beginning, over those of coordinates in which a posterior is about as curved along each
+axis: the Gaussian narrows from there, so that where it ends depends little on where it begins. See docs/measured.md."""
+
 WHOLE_RATE = 0.8
 """Rate of the covariance in whole steps."""
 
@@ -146,7 +150,7 @@ def fit_gaussian(
     mean, local = start.copy(), _Local.about(level, start, places)
     if covariance is None:
         axes = Coordinates.about(level, start, places, prior, share).axes
-        covariance = linalg.product(axes, axes.T)
+        covariance = WIDE_START**2 * linalg.product(axes, axes.T)
     scatter, half_square = _Scatter(share, None if share_is_known else local), 0.0
     scattered, left = 0.0, 1.0
     for step in range(effort.most):
