@@ -357,7 +357,7 @@ def _motion(seen: Fitness) -> Notice | None:
             "motion must be of the clock of the images, and go on without gaps."
         )
         return Notice("warn", "motion_apart", text)
-    if seen.speed_mps is None:
+    if seen.speed_mps is None and seen.turn_degps is not None:
         text = "Ego-motion is rotation only: sweeps are turned back, not shifted; drive slowly, or add an odometry."
         return Notice("warn", "rotation_only", text)
     if not seen.point_time and seen.speed_mps is not None and seen.speed_mps[1] > SMEARING_MPS:

@@ -156,7 +156,7 @@ def test_two_sensors_have_each_their_own_metadata(tmp_path: Path) -> None:
     assert np.abs(front.xyz_m - rear.xyz_m).max() > 0.005
     assert len(open_lidars(str(path), PACKETS, "/rear/lidar_packets").pairs(3)) == 3
     unclear = write_entries(tmp_path / "unclear.mcap", [of_other, elsewhere, *others(), *packets()])
-    with pytest.raises(SourceError, match="say what the LiDAR is, /rear/metadata, /else/metadata: choose"):
+    with pytest.raises(SourceError, match="messages say what the LiDAR is, /rear/metadata, /else/metadata: choose"):
         open_source(str(unclear))
     selected = sweeps_of(open_source(f"{unclear}?metadata=/rear/metadata"))[0]
     np.testing.assert_array_equal(selected.xyz_m, rear.xyz_m)

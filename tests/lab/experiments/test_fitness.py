@@ -160,6 +160,10 @@ def test_motion_of_another_clock_is_reported() -> None:
     later = tuple(replace(motion, stamp_ns=motion.stamp_ns + 37_000 * MS) for motion in recording.motions)
     assert codes(replace(recording, motions=later))["motion_apart"] == "warn"
     assert "motion_apart" not in codes(recording)
+    # Without pairs and without motion near an image nothing shows that it is rotation only.
+    separate = a_recording(late_ms=-3_600_000)
+    far = tuple(replace(motion, stamp_ns=motion.stamp_ns + 7_200_000 * MS) for motion in separate.motions)
+    assert "rotation_only" not in codes(replace(separate, motions=far))
 
 
 @pytest.mark.parametrize(

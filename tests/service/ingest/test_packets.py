@@ -215,6 +215,26 @@ def test_what_is_missing_is_named_with_what_to_do(caplog: pytest.LogCaptureFixtu
         unnamed.frame(InputSample(ouster().sent[0][3], "zenoh/bytes"))
 
 
+@pytest.mark.fault("two LiDARs whose correction files come on one topic", "refused until one is named")
+def test_two_correction_files_are_refused_until_one_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    other = bytes_message(correction_file([one + 0.1 for one in DIRECTIONS[0]], DIRECTIONS[1]))
+    entries = [(BEGIN_NS, "/top/lidar_corrections", messages.BYTES, other), *hesai().entries]
+    assert Sensor(frame_id="hesai").take([entries[0], *hesai(corrected=False).sent]) == TURNS - 2
+    sensor = Sensor(frame_id="hesai")
+    assert sensor.take(entries) == 0
+    assert sensor.lost == {"message_type": TURNS}
+    assert "name the right one with lidar.metadata_topic" in caplog.text
+    assert sensor.take([entries[0], entries[1]] * 10) == 0
+    # Recorded on one topic.
+    shared = [(time, "/top/lidar_corrections" if name == messages.BYTES else topic, name, data)
+              for time, topic, name, data in entries]  # fmt: skip
+    storage = open_storage(write_entries(tmp_path / "drive.mcap", [*shared, shared[0]]))
+    unread = build_index(storage, CloudDecoder()).unread["/top/lidar_packets"]
+    assert "several messages say what the LiDAR is, /top/lidar_corrections, /top/lidar_corrections#2" in unread
+    named = build_index(storage, CloudDecoder(), "/top/lidar_corrections#2")
+    assert len(named.streams["/top/lidar_packets"].locations) == TURNS
+
+
 def test_a_sensor_that_is_set_otherwise_begins_anew() -> None:
     before, after = ouster(), ouster(Ouster("LEGACY"))
     sensor = Sensor()

@@ -160,7 +160,7 @@ class BagIndex:
         unread: topics of frames in another form, with what they have and what to do.
         transforms_at: places of the messages of all other transforms, by topic, in the order in the bag.
         packets: messages of packets by topic, until `resolve_packets` makes streams of them.
-        descriptions: messages in which LiDARs say what they are, by topic.
+        descriptions: messages in which LiDARs say what they are, by topic (see `packet_streams.description_name`).
     """
 
     path: Path
@@ -326,8 +326,9 @@ class BagIndex:
             stream.locations.append(MessageLocation(stamp_ns, entry.place, name, frame_id))
             stream.lags_s.append((entry.logged_ns - stamp_ns) * 1e-9)
         elif name in (messages.STRING, messages.BYTES) and packet_streams.is_description(entry.data):
-            if entry.topic in self.descriptions or len(self.descriptions) < LISTED:
-                self.descriptions[entry.topic] = entry.data
+            name = packet_streams.description_name(entry.topic, entry.data, self.descriptions)
+            if name in self.descriptions or len(self.descriptions) < LISTED:
+                self.descriptions[name] = entry.data
         elif name == messages.CAMERA_INFO:
             self._decoded(entry, self.infos.setdefault(entry.topic, camera_info.CameraInfos()).add)
         elif name == messages.TF and entry.topic == TF_STATIC:

@@ -105,6 +105,16 @@ def is_description(data: bytes) -> bool:
     return any(of_maker.DESCRIBED in begin for of_maker in FORMATS.values())
 
 
+def description_name(topic: str, text: bytes, known: Mapping[str, bytes]) -> str:
+    """The name of a message in which a sensor says what it is: its topic; with a number if it is another correction
+    file than those that came there, because two sensors then publish on the topic. An Ouster that starts again says
+    something else of itself, and the last one holds."""
+    if hesai_packets.DESCRIBED not in text[:MAX_DESCRIPTION_BYTES]:
+        return topic
+    names = (topic, *(f"{topic}#{number}" for number in range(2, len(known) + 2)))
+    return next(name for name in names if known.get(name, text) == text)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PacketSweep:
     """The messages of a sweep. It is stamped in its middle.
@@ -176,7 +186,7 @@ class PacketStream:
         adjacent = [name for name in known if name.rpartition("/")[0] == self.topic.rpartition("/")[0]]
         selected = [given] if given is not None else adjacent or list(known)
         if len(selected) > 1:
-            text = f"several topics say what the LiDAR is, {', '.join(selected)}: choose with ?metadata=/TOPIC"
+            text = f"several messages say what the LiDAR is, {', '.join(selected)}: choose with ?metadata=/TOPIC"
             raise DecodeError(Refusal.MESSAGE_TYPE, text)
         return of_maker.sensor_of(self.glimpses, known.get(selected[0]) if selected else None)
 
@@ -291,12 +301,11 @@ class PacketAssembler:
         sensor: the sensor that sends; None until that is known.
     """
 
-    def __init__(self, type_name: str, description: bytes | None = None) -> None:
-        """`description`: what the sensor says of itself, if that is known."""
+    def __init__(self, type_name: str) -> None:
         self.type_name = type_name
         self.sensor: PacketSensor | None = None
         self._format = FORMATS[type_name]
-        self._description = description
+        self._descriptions: dict[str, bytes] = {}
         self._open: deque[_OpenSweep] = deque()
         self._number, self._last = 0, b""
         self._is_first = True
@@ -310,8 +319,10 @@ class PacketAssembler:
 
     def describe(self, text: bytes) -> None:
         """A message came in which a sensor says what it is. One that differs from the last begins anew."""
-        if self._format.DESCRIBED in text and text != self._description:
-            self._description, self.sensor, self._is_first = text, None, True
+        known = text in self._descriptions.values() or len(self._descriptions) > 1
+        if self._format.DESCRIBED in text and not known:
+            self._descriptions[description_name("", text, self._descriptions)] = text
+            self.sensor, self._is_first = None, True
             self._open.clear()
 
     def add(self, message: bytes, received_ns: int) -> LidarFrame | None:
@@ -326,7 +337,10 @@ class PacketAssembler:
             self.describe(message)
             return None
         if self.sensor is None:
-            self.sensor = self._format.sensor_of([glimpse], self._description)
+            if len(self._descriptions) > 1:
+                text = "several messages say what the LiDAR is: name the right one with lidar.metadata_topic, or give"
+                raise DecodeError(Refusal.MESSAGE_TYPE, f"{text} lidar.metadata")
+            self.sensor = self._format.sensor_of([glimpse], self._descriptions.get(""))
         before = [self._open[-1].glimpses[0], self._last] if self._open else []
         _, numbers = self.sensor.heads([*before, glimpse])
         if numbers[-1] == -1:

@@ -333,7 +333,7 @@ class SampleReader:
         self._limits = limits
         self._moving = MovingFrame(stream.parent, stream.child) if isinstance(stream, OpenEgoConfig) else None
         self._packets: PacketAssembler | None = None
-        self._description: bytes | None = None
+        self._descriptions: deque[bytes] = deque(maxlen=2)
         self._named: PacketSensor | None = None
 
     @property
@@ -380,7 +380,8 @@ class SampleReader:
 
     def _describe(self, text: bytes) -> None:
         if packet_streams.is_description(text) and len(text) <= packet_streams.MAX_DESCRIPTION_BYTES:
-            self._description = text
+            if text not in self._descriptions:
+                self._descriptions.append(text)
             if self._packets is not None:
                 self._packets.describe(text)
 
@@ -389,11 +390,13 @@ class SampleReader:
             if metadata is not None:
                 try:
                     with metadata.open("rb") as file:
-                        self._description = file.read(packet_streams.MAX_DESCRIPTION_BYTES)
+                        self._descriptions = deque([file.read(packet_streams.MAX_DESCRIPTION_BYTES)])
                 except OSError as error:
                     text = f"cannot read lidar.metadata: {error.strerror}"
                     raise DecodeError(Refusal.MESSAGE_TYPE, text) from error
-            self._packets = PacketAssembler(type_name, self._description)
+            self._packets = PacketAssembler(type_name)
+            for described in self._descriptions:
+                self._packets.describe(described)
         sent = MessageAttachment.parse(sample.attachment)
         frame = self._packets.add(sample.payload, time.time_ns() if sent is None else sent.source_ns)
         sensor = self._packets.sensor
