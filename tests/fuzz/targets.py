@@ -38,7 +38,7 @@ from coec.config import (
     ZenohConfig,
     load_config,
 )
-from coec.errors import SourceError, UsageError
+from coec.errors import DecodeError, SourceError, UsageError
 from coec.geometry.cameras import build, project_point
 from coec.io.depth.model_cards import CARDS, read_card
 from coec.io.images import Inspector, decode_bgr, decode_depth, encode_depth_png, encode_png
@@ -55,7 +55,7 @@ from coec.io.rig_files import baseline_to_json, camera_of, load_baseline, rig_of
 from coec.io.ros import message_decoding, message_encoding, messages
 from coec.io.ros.camera_info import decode_info, intrinsics_of_info
 from coec.io.ros.message_decoding import ENCODINGS
-from coec.io.ros.packet_streams import PacketStream
+from coec.io.ros.packet_streams import PacketAssembler, PacketStream
 from coec.io.ros.transforms import MovingFrame, StaticTransforms, decode_static_transforms, frames_in
 from coec.io.ros.translations import TRANSLATIONS, translation_of
 from coec.io.serialise import estimate_of, result_of
@@ -454,14 +454,23 @@ def _video_seeds() -> list[bytes]:
 
 def _packets(data: bytes, folder: Path) -> None:
     """The first byte chooses the maker. What describes the sensor stands behind its length, and messages behind
-    theirs."""
+    theirs. They are read as they come, and as those of a recording."""
     del folder
     texts, at = [], 1
     while at + 4 <= len(data):
         (length,) = struct.unpack_from("<I", data, at)
         texts.append(data[at + 4 : at + 4 + length])
         at += 4 + length
-    stream = PacketStream("/packets", PACKETS[(data[0] if data else 0) % len(PACKETS)])
+    type_name = PACKETS[(data[0] if data else 0) % len(PACKETS)]
+    live = PacketAssembler(type_name)
+    for text in texts[:1]:
+        live.describe(text)
+    for number, message in enumerate(texts[1:]):
+        with suppress(DecodeError):
+            frame = live.add(message, 1000 * number)
+            if frame is not None:
+                _inspected(frame)
+    stream = PacketStream("/packets", type_name)
     for number, message in enumerate(texts[1:]):
         stream.add(message, (number,), 1000 * number)
     sensor = stream.sensor({}, (texts[0] or None) if texts else None)
@@ -477,12 +486,13 @@ def _packets_seeds() -> list[bytes]:
     for profile in PIXELS:
         sensor = Ouster(profile, columns=32)
         ranges = np.full((32, 4), 5000)
-        packets = [one for frame in range(2) for one in sensor.packets(ranges, ranges, frame * 10**8, frame, 10**6)]
+        packets = [one for frame in range(4) for one in sensor.packets(ranges, ranges, frame * 10**8, frame, 10**6)]
         seeds.append((0, [sensor.metadata(), *map(ouster_message, packets)]))
     for hesai in HESAIS.values():
         ranges = np.full((2 * hesai.blocks, hesai.lasers), 1000)
         correction = correction_file([1.0] * hesai.lasers, [0.5] * hesai.lasers)
-        seeds.append((1, [correction, hesai_message(hesai.packets(ranges, ranges % 251, STAMP_NS, 10**6))]))
+        message = hesai_message(hesai.packets(ranges, ranges % 251, STAMP_NS, 10**6))
+        seeds.append((1, [correction, message, message, message]))
     return [bytes([maker]) + b"".join(struct.pack("<I", len(text)) + text for text in texts) for maker, texts in seeds]
 
 
