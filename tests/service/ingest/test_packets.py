@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -263,25 +264,34 @@ def test_the_topic_of_the_metadata_belongs_to_the_stream(tmp_path: Path, middlew
 
 
 @pytest.mark.fault("a pair whose LiDAR publishes packets only", "discovery names the model and what is missing")
-def test_discovery_names_the_sensor_and_what_it_lacks(tmp_path: Path) -> None:
-    config = configured(tmp_path, points="/top/lidar_packets")
-    watch = DiscoveryListener(config, {})
-    maker = ouster()
+@pytest.mark.parametrize(
+    ("name", "child", "missing", "origin"),
+    [
+        ("Ouster", "os_sensor", "no metadata: .* lidar.metadata", "Ouster with 4 beams (RNG19_RFL8_SIG16_NIR16)"),
+        ("RoboSense", "rslidar", "no DIFOP packet", "RoboSense RS-32"),
+        ("Hesai, nominal", "hesai", "", "Hesai PandarXT-32. The packets of the LiDAR are read with the nominal"),
+    ],
+)
+def test_discovery_names_the_sensor_and_what_it_lacks(
+    tmp_path: Path, name: str, child: str, missing: str, origin: str
+) -> None:
+    watch = DiscoveryListener(configured(tmp_path, points="/top/lidar_packets"), {})
+    maker = MAKERS[name]()
     tree = STORE.serialize_cdr(
         STORE.types[messages.TF]([transform_message("camera", "base", np.eye(4)),
-                                  transform_message("base", "os_sensor", T_BASE_LIDAR)]), messages.TF
+                                  transform_message("base", child, T_BASE_LIDAR)]), messages.TF
     )  # fmt: skip
     watch.take_transforms(InputSample(bytes(tree), SAMPLES[TF_STATIC].encoding))
     watch.take_info("front", SAMPLES[INFO])
     watch.take_frame("front", "camera", SAMPLES[CAMERA])
-    watch.take_frame("front", LIDAR, sample_of(maker.sent[0]))
-    watch.update()
-    (reason,) = watch.nominal("front").awaits
-    assert "no metadata" in reason.text
-    assert "lidar.metadata" in reason.text
+    if missing:
+        watch.take_frame("front", LIDAR, sample_of(maker.sent[1]))
+        watch.update()
+        (reason,) = watch.nominal("front").awaits
+        assert re.search(missing, reason.text)
     for entry in maker.entries[:3]:
         watch.take_frame("front", LIDAR, sample_of(entry))
     watch.update()
     ready = watch.ready()["front"]
-    assert ready.pair.lidar.frame_id == "os_lidar"
-    assert "Ouster with 4 beams (RNG19_RFL8_SIG16_NIR16)" in ready.origins["lidar.frame_id"]
+    assert ready.pair.lidar.frame_id == ("os_lidar" if name == "Ouster" else child)
+    assert origin in ready.origins["lidar.frame_id"]
