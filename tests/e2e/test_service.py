@@ -177,6 +177,7 @@ def _bring_into_a_solve(running: Service, frames: list[Frame]) -> int:
     return int(worker.pid)
 
 
+@pytest.mark.slow
 @pytest.mark.fault("the worker is killed, then the service stopped, in a solve", "no window is lost")
 def test_worker_killed_and_service_stopped_in_a_solve_lose_no_window(
     tmp_path: Path, drive: Drive, router: Router

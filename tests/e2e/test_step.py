@@ -1,5 +1,6 @@
 """A mount that moves by one degree while the service runs: noticed, told, corrected, remembered; with `apply: never`
-told, and left to people. Sensor time is compressed."""
+told, and left to people. Sensor time is compressed. `peers/test_vehicle.py` has the knock alone, `test_daemon.py` the
+restart."""
 
 from __future__ import annotations
 
@@ -67,6 +68,7 @@ def commanded(running: Service, name: str, credentials: Credentials) -> str:
     return str(json.loads(reply.payload)["code"])
 
 
+@pytest.mark.slow
 @pytest.mark.fault(
     "secrets in endpoints, in the Zenoh file and in private keys, over a whole life with a moved mount and a restart",
     "none is in any reply, log, command line, window, evidence or state",

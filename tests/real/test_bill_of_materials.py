@@ -8,6 +8,7 @@ import os
 import sys
 from pathlib import Path
 
+import pytest
 from packaging.utils import canonicalize_name
 
 from conftest import REPOSITORY
@@ -15,6 +16,7 @@ from deploy.test_locks import needed
 from real.packages import completed, require_index
 
 
+@pytest.mark.slow
 def test_everything_that_coec_needs_is_listed_with_its_licence(tmp_path: Path) -> None:
     require_index(tmp_path / "fetched")
     completed(sys.executable, "-m", "venv", tmp_path / "tools")
