@@ -295,8 +295,10 @@ def _assessed(
         assumed = Assumptions(edges.to_the_sharpest, window, held, held_to_m, lens)
         posterior = measure_posterior(assumed, pose)
         rivals = tuple(significance_next_to(assumed, rival) for rival in result.rivals)
-        # A held centre that is a little off displaces most edges of a near scene, and what frames share with them.
-        likely = pose if posterior is None else se3.perturb(pose, posterior.hypotheses[0].deviation[:6])
+        # A centre that nobody searched and that is a little off displaces most edges of a near scene.
+        likely = pose
+        if posterior is not None and dof == TRANSLATIONS.start:
+            likely = se3.perturb(pose, posterior.hypotheses[0].deviation[:6])
         independent = independent_samples_at(edges.sharp, likely)
         if posterior is not None:
             uncertainty = _posterior_uncertainty(posterior, objective, pose, moved, window, independent.count)
