@@ -35,6 +35,8 @@ def test_a_batch_makes_tables_compares_with_the_vehicles_and_goes_on(
     assert refused.status == 2
     assert "--resume" in refused.err
 
+    assert "it is a file; name a folder" in coec("batch", recorded, "--output", bad).err
+
     second = coec("batch", recorded, bad, "--output", folder, "--jobs", 1, "--resume")
     assert second.status == 0
     assert "evaluated before" in second.out

@@ -42,6 +42,7 @@ class BatchFolder:
         """
         self._folder = folder
         optional_library("pyarrow.parquet")  # before anything is written
+        user_files.try_folder(folder)
         self._open(settings, resume=resume)
         self._written = tabulated_urls(folder)
         self._rows: list[WindowRow] = []
