@@ -77,6 +77,8 @@ def _messages() -> Iterator[tuple[str, str, str, str]]:
 def _parts() -> Iterator[tuple[str, str]]:
     yield "encodings of raw images", _codes((*ENCODINGS, *SEMIPLANAR, *DEEP_COLOURS))
     yield "fields that are times of points, the first that there is", _codes(point_clouds.FIELDS)
+    yield "fields that are reflectance, likewise", _codes(point_clouds.REFLECTANCE_FIELDS)
+    yield "fields that are scan lines, likewise", _codes(point_clouds.RING_FIELDS)
     yield "fields that name one LiDAR of several", _codes(point_clouds.SOURCE_FIELDS)
     yield "formats of packed clouds", _codes(("draco", *packed_clouds.FORMATS))
     units: dict[float, list[str]] = {}

@@ -150,6 +150,16 @@ def test_intensity_of_any_type(form: str) -> None:
     assert frame.intensity.tolist() == [7, 200]
 
 
+@pytest.mark.parametrize("name", ["reflectivity", "reflectance"])
+def test_reflectance_by_another_name_is_intensity_if_there_is_none(name: str) -> None:
+    frame = sweep(packed_cloud([*XYZ, (name, "<u2", [7, 200])]))
+    assert frame.intensity is not None
+    assert frame.intensity.tolist() == [7, 200]
+    both = sweep(packed_cloud([*XYZ, (name, "<u2", [7, 200]), ("intensity", "<f4", [1, 2])]))
+    assert both.intensity is not None
+    assert both.intensity.tolist() == [1, 2]
+
+
 @pytest.mark.parametrize(("name", "form"), [("ring", "u1"), ("ring", "<u2"), ("ring", "<u4"), ("channel", "<u2")])
 def test_ring_of_any_unsigned_type(name: str, form: str) -> None:
     frame = sweep(packed_cloud([*XYZ, (name, form, [7, 63])]))

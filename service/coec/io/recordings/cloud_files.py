@@ -25,7 +25,7 @@ from coec.errors import DecodeError, SourceError
 from coec.geometry.points import lengths
 from coec.io.frame_validation import Refusal, finite_rows
 from coec.io.recordings.cloud_formats import MAX_POINTS, TableError, columns_of_las, parse_pcd, parse_ply, viewpoint_of
-from coec.io.ros.point_clouds import FIELDS, offsets_s, time_field
+from coec.io.ros.point_clouds import FIELDS, REFLECTANCE_FIELDS, offsets_s, time_field
 from coec.io.user_files import read_bytes, read_npy, read_npz
 
 Columns = Mapping[str, NDArray[Any]]
@@ -127,7 +127,9 @@ def _frame(
         keep &= np.isfinite(time_offset_s)
     if not keep.any():
         raise SourceError(f"{path} holds no finite point ({len(xyz_m)} rows)")
-    intensity, ring = columns.get("intensity"), next((columns[name] for name in _RINGS if name in columns), None)
+    intensity, ring = (
+        next((columns[name] for name in names if name in columns), None) for names in (REFLECTANCE_FIELDS, _RINGS)
+    )
     if ring is not None and (ring.dtype.kind not in "iu" or int(ring.max()) > 0xFFFF or int(ring.min()) < 0):
         ring = ring if _are_rings(ring, xyz_m) else None
     return LidarFrame(

@@ -54,7 +54,13 @@ FIELDS: Final = (
 ON_A_CLOCK: Final = ("timestamp", "time_stamp")
 """Names that drivers use both for the time of day and for the time since the stamp."""
 
-OTHERWISE_READ: Final = ("x", "y", "z", "intensity", "ring", "channel", "line", "rgb", "rgba")
+REFLECTANCE_FIELDS: Final = ("intensity", "reflectivity", "reflectance")
+"""Names that drivers use for how much light comes back; the first that a cloud has counts."""
+
+RING_FIELDS: Final = ("ring", "channel", "line")
+"""Names that drivers use for the number of the scan line, likewise."""
+
+OTHERWISE_READ: Final = ("x", "y", "z", *REFLECTANCE_FIELDS, *RING_FIELDS, "rgb", "rgba")
 """Names of fields that are no times."""
 
 LIKE_A_TIME: Final = re.compile(r"(?i:time|stamp|(^|_)(t|ts|dt|n?sec|[mnu]s|[mu]sec)(_|$))|[a-z]T($|[A-Z_])")
@@ -428,10 +434,11 @@ def frame_of(
 ) -> LidarFrame:
     """The sweep of a message whose header is already checked.
 
-    `x y z` may be float32 or float64; `intensity` any number; `ring` (or `channel`, `line`) an unsigned integer. The
-    time is one of `FIELDS`, any number, read as recognised in `point_time` or as the argument `point_time` says.
-    Optional fields of other types are left out, and so are fields with several values per point. A `stamp_ns` of 0
-    means no stamp; then the first point gives it, if it has a time of day. `source`: see `points_of_source`.
+    `x y z` may be float32 or float64; intensity, of `REFLECTANCE_FIELDS`, any number; ring, of `RING_FIELDS`, an
+    unsigned integer. The time is one of `FIELDS`, any number, read as recognised in `point_time` or as the argument
+    `point_time` says. Optional fields of other types are left out, and so are fields with several values per point. A
+    `stamp_ns` of 0 means no stamp; then the first point gives it, if it has a time of day. `source`: see
+    `points_of_source`.
 
     Raises:
         DecodeError: `cloud_shape`, `cloud_fields`, `cloud_too_large`, `cloud_empty`, `cloud_time`,
@@ -441,8 +448,8 @@ def frame_of(
     by_name = {field.name: field for field in reversed(message.fields)}  # the first field of a name counts
     with np.errstate(over="ignore", invalid="ignore"):  # values beyond float32 become infinite and are dropped
         xyz_m = _positions(message, by_name)
-        intensity = _column(message, by_name.get("intensity"), "fiu")
-        ring = _column(message, next((by_name[n] for n in ("ring", "channel", "line") if n in by_name), None), "u")
+        intensity = _column(message, next((by_name[n] for n in REFLECTANCE_FIELDS if n in by_name), None), "fiu")
+        ring = _column(message, next((by_name[n] for n in RING_FIELDS if n in by_name), None), "u")
         if ring is not None and ring.itemsize > 2 and int(ring.max()) > 0xFFFF:
             raise DecodeError(Refusal.CLOUD_FIELDS, "a ring number exceeds 65535")
         times = _times(message, by_name, finite_rows(xyz_m), stamp_ns, point_time)
