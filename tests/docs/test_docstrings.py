@@ -13,13 +13,6 @@ from conftest import REPOSITORY
 ENTRY = re.compile(r"    (\*{0,2}\w+(?:, \*{0,2}\w+)*): ")
 """`name: ...` or `name, other: ...` in a section of a docstring."""
 
-STALE = {
-    "service/coec/calibration/objective/mutual_information.py: Cells: sight",
-    "service/coec/calibration/search/global_search.py: _Round: apart_rad",
-    "service/coec/geometry/edges/alignment.py: ascend: climbs",
-}
-"""Entries that still have an earlier name. The list may only become shorter."""
-
 Documented = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
 
 
@@ -66,7 +59,7 @@ def test_docstrings_name_the_arguments_and_attributes_that_are_there(package: st
         if isinstance(node, Documented)
         for name in unknown(node)
     }
-    assert stale == {one for one in STALE if one.startswith(f"{package}/")}
+    assert not stale
 
 
 def test_an_argument_of_another_name_is_reported() -> None:

@@ -17,7 +17,7 @@ def _nothing(_: str) -> None:
 
 @contextmanager
 def listening(listener: Listener, on_end: Listener = _nothing) -> Iterator[None]:
-    """Inside the context, `hearer` is called repeatedly while a kernel and those inside it are compiled, and `on_end`
+    """Inside the context, `listener` is called repeatedly while a kernel and those inside it are compiled, and `on_end`
     when all of them are, or when that failed. Kernels read from the cache cause no calls."""
     _listeners.append(listener)
     _on_end.append(on_end)
@@ -29,7 +29,7 @@ def listening(listener: Listener, on_end: Listener = _nothing) -> Iterator[None]
 
 
 def notify(kernel: str) -> None:
-    """Tell all hearers that a step of the compilation of this kernel begins."""
+    """Tells all listeners that a step of the compilation of this kernel begins."""
     for listener in tuple(_listeners):
         listener(kernel)
 

@@ -65,7 +65,7 @@ class Cells:
             frames of the sums over the sectors is the objective, up to a constant.
         step_rad: difference step at which the hill still looks like a hill: no wider than its top, no finer than its
             ripples.
-        sight: the points in view at the pose.
+        points: those in view at the pose.
     """
 
     at: Callable[[NDArray[np.float64]], NDArray[np.float64]]

@@ -50,7 +50,7 @@ class _Round:
 
     Attributes:
         poses: how many poses begin it, the best on its chart.
-        apart_rad: how far these lie apart at least.
+        separation_rad: how far these lie apart at least.
         chart: the coarse or the fine chart, `thinned` or not.
         points: with how many of its edges they climb at most.
         step_rad, halvings: first step, and how often it is halved.

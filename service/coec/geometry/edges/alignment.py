@@ -29,7 +29,7 @@ BLOCK = 256
 cache."""
 
 LEAST_RANGE2_M2, MOST_RANGE2_M2 = np.float32(1e-18), np.float32(1e18)
-"""Limits of the squared distance of a valid point from the camera, as in `cameras.formulas`."""
+"""Limits of the squared distance of a valid point from the camera, as in `cameras.base`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -464,7 +464,7 @@ def ascend(frames: EdgeFrames, starts: list[AscentStart], moves: NDArray[np.floa
 
     Args:
         frames: the frames of all climbs.
-        climbs: where they begin.
+        starts: where they begin.
         moves: (L, M, 4, 4) M moves for each of L levels, from coarse to fine.
     """
     spans = np.array([(start.first, start.last) for start in starts], np.int64)

@@ -324,7 +324,11 @@ class StreamCounts:
 
 
 class SampleReader:
-    """Decodes the samples of one stream to frames."""
+    """Decodes the samples of one stream to frames.
+
+    Attributes:
+        packets: makes sweeps of the packets of this stream; None before any came.
+    """
 
     def __init__(self, kind: str, stream: AnyStreamConfig, limits: LimitsConfig) -> None:
         """`kind` is what the stream brings: `CAMERA`, `LIDAR` or `EGO`."""
@@ -332,14 +336,9 @@ class SampleReader:
         self._stream = stream
         self._limits = limits
         self._moving = MovingFrame(stream.parent, stream.child) if isinstance(stream, OpenEgoConfig) else None
-        self._packets: PacketAssembler | None = None
+        self.packets: PacketAssembler | None = None
         self._descriptions: deque[bytes] = deque(maxlen=2)
         self._named: PacketSensor | None = None
-
-    @property
-    def packets(self) -> PacketAssembler | None:
-        """What makes sweeps of the packets of this stream; None: no packets have come."""
-        return self._packets
 
     def frame(self, sample: InputSample) -> Frame | None:
         """The frame in a sample, or the sweep that it ends; None if it ends none, or holds only transforms of other
@@ -382,11 +381,11 @@ class SampleReader:
         if packet_streams.is_description(text) and len(text) <= packet_streams.MAX_DESCRIPTION_BYTES:
             if text not in self._descriptions:
                 self._descriptions.append(text)
-            if self._packets is not None:
-                self._packets.describe(text)
+            if self.packets is not None:
+                self.packets.describe(text)
 
     def _sweep(self, type_name: str, sample: InputSample, metadata: Path | None) -> LidarFrame | None:
-        if self._packets is None or self._packets.type_name != type_name:
+        if self.packets is None or self.packets.type_name != type_name:
             if metadata is not None:
                 try:
                     with metadata.open("rb") as file:
@@ -394,17 +393,17 @@ class SampleReader:
                 except OSError as error:
                     text = f"cannot read lidar.metadata: {error.strerror}"
                     raise DecodeError(Refusal.MESSAGE_TYPE, text) from error
-            self._packets = PacketAssembler(type_name)
+            self.packets = PacketAssembler(type_name)
             for described in self._descriptions:
-                self._packets.describe(described)
+                self.packets.describe(described)
         sent = MessageAttachment.parse(sample.attachment)
-        frame = self._packets.add(sample.payload, time.time_ns() if sent is None else sent.source_ns)
-        sensor = self._packets.sensor
+        frame = self.packets.add(sample.payload, time.time_ns() if sent is None else sent.source_ns)
+        sensor = self.packets.sensor
         if frame is not None and sensor is not None and sensor is not self._named:
             self._named = sensor
             fields = {"sensor": self._stream.sensor}
             _log.info(f"packets of the LiDAR: {sensor.name}", extra={"fields": fields})
-            for note in self._packets.notes:
+            for note in self.packets.notes:
                 _log.log(logging.WARNING if note.level == "warn" else logging.INFO, note.text, extra={"fields": fields})
         return frame
 
