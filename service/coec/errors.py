@@ -103,6 +103,10 @@ class SourceError(CoecError):
     reply_code = "bad_source"
 
 
+class MisreadError(SourceError):
+    """A recording whose frames are not what they are taken for: in another unit, or measured from another origin."""
+
+
 class WindowError(CoecError):
     """A window file that cannot be read, or that holds too little to calibrate from."""
 

@@ -65,3 +65,14 @@ def test_a_single_frame_that_calibrate_accepts_is_not_predicted_to_be_refused(co
     assert predicted.document["camera"]["frames"] == 1
     assert predicted.document["prediction"] != ("refused" if accepted else "accepted")
     assert predicted.status == int(predicted.document["prediction"] == "refused")
+
+
+def test_damaged_frames_are_counted_by_check_and_calibrate(coec: Coec, tmp_path: Path) -> None:
+    source = write(Drive(seed=2), tmp_path)
+    image = sorted(source.glob("**/*.png"))[0]
+    image.write_bytes(image.read_bytes()[:-20])
+    checked = coec("check", source, "--depth", "stereo")
+    assert f"warn  Frames or records are left out, 1 damaged (1 image_truncated); the first: {image}" in checked.out
+    document = coec("calibrate", source, "--depth", "stereo", "--json").document
+    assert document["pairs"] == 7
+    assert [one["code"] for one in document["recognitions"]] == ["damaged_frames"]

@@ -18,10 +18,13 @@ from mcap.writer import Writer
 from cli.conftest import SMALL, Coec
 from coec.config import LimitsConfig, ZenohConfig
 from coec.io.ros.message_decoding import decode
+from coec.io.ros.messages import VELODYNE_SCAN
 from coec.io.ros.wire_format import MessageAttachment
 from coec.io.zenoh.bus import open_session
 from support.fake_worker import wait_until
+from support.packets import OUSTER, ouster_message, write_entries
 from support.recordings import STORE, Bag, drive_messages
+from support.ros import velodyne_scan
 from support.router import free_port
 
 SECONDS = 20.0
@@ -188,6 +191,22 @@ def test_types_that_are_not_ros_own_have_no_key_of_rmw_zenoh(coec: Coec, listene
     document = played(coec, listener, bag, "--middleware", "ros2dds", "--start-now")
     assert document["frames"] == {"/wheels": 1, "/word": 1}
     assert listener.payloads("wheels") == [b"\0\1\0\0anything"]
+
+
+@pytest.mark.parametrize("middleware", ["rmw_zenoh", "ros2dds"])
+def test_packets_of_lidars_are_played_byte_for_byte(
+    coec: Coec, listener: Listener, tmp_path: Path, middleware: str
+) -> None:
+    packets = {"/velodyne_packets": (VELODYNE_SCAN, velodyne_scan(3)), "/os/packets": (OUSTER, ouster_message(b"abc"))}
+    entries = [(number, topic, *sent) for number, (topic, sent) in enumerate(packets.items())]
+    bag = write_entries(tmp_path / "b.mcap", entries)
+    document = played(coec, listener, bag, "--middleware", middleware)
+    assert document["frames"] == dict.fromkeys(packets, 1)
+    keys = {topic: key for topic in packets for key in listener.samples if topic.strip("/") in key.replace("%", "/")}
+    assert {topic: listener.payloads(key) for topic, key in keys.items()} == {t: [d] for t, (_, d) in packets.items()}
+    listener.samples.clear()
+    reported = coec("play", bag, "--middleware", middleware, "--rate", 0, "--connect", listener.endpoint, "--start-now")
+    assert "stamps stay as recorded, because they are within packets: /os/packets, /velodyne_packets" in reported.err
 
 
 @pytest.mark.fault("a bag with topics that are not valid ROS names", "they are named, escaped, and not played")

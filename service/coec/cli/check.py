@@ -42,7 +42,7 @@ def check(
     from coec.calibration.monitor.check_verdict import MIN_PAIRS
     from coec.io.recordings.layouts import open_source
     from coec.io.recordings.manifest import manifest_of
-    from coec.reports.recording_fitness import Notice, fitness_of
+    from coec.reports.recording_fitness import Notice, find_damaged, fitness_of
 
     manifest = manifest_of(source) if fix else None
     try:
@@ -53,6 +53,7 @@ def check(
         raise
     with console.progress() as bars:
         times = StageTimes(bars)
+        find_damaged(recording, lambda done, total: times.step("read", done, total))
         seen = fitness_of(recording)
         times.step("examine", 1, 1)
         # A wrong pose may leave nothing in view. Which mistake it is, the trial finds.

@@ -229,6 +229,7 @@ def _publish_topics(
         UsageError, SourceError: no such topic, or a message whose stamps cannot be shifted to now.
         ConnectionFailedError: no router.
     """
+    from coec.io.ros import messages
     from coec.io.ros.topics import shifted as shifted_message
     from coec.io.zenoh.player import TopicPlayer, dialect_of, repeated
     from coec.io.zenoh.query_client import connected
@@ -238,6 +239,9 @@ def _publish_topics(
     if first is None:
         raise SourceError(f"{programme.name} holds no message on {', '.join(selected)}")
     shift_ns = pace.shift_ns(first.stamp_ns)
+    inside = sorted(topic for topic, info in selected.items() if info.type_name in messages.OTHER_TYPES)
+    if inside and pace.start_now:
+        console.say(f"coec: stamps stay as recorded, because they are within packets: {', '.join(inside)}")
     with until_signal() as stop, connected(target.endpoints, CONNECT_S) as session:
         dialect = dialect_of(middleware, session, target.ros.domain, target.ros.namespace)
         player = TopicPlayer(session, dialect, {topic: info.type_name for topic, info in selected.items()})

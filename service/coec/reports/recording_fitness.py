@@ -4,7 +4,7 @@ The stamps of all frames are known without loading them; only a few frames, even
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
 from types import MappingProxyType
@@ -21,7 +21,14 @@ from coec.geometry.points import lengths
 from coec.geometry.projection import share_in_image
 from coec.io.images import is_order_swapped
 from coec.io.recordings.clocks import clock_separation_text, clocks_text
-from coec.io.recordings.recording_source import RecordingSource, evenly_spread, recognitions_of
+from coec.io.recordings.recording_source import (
+    HasGroundTruth,
+    RecordingSource,
+    damaged_of,
+    evenly_spread,
+    recognitions_of,
+)
+from coec.io.recordings.window_cutting import readable
 
 NS_PER_S = 1e9
 
@@ -125,6 +132,25 @@ class Fitness:
     remarks: tuple[Notice, ...]
 
 
+MOST_EXAMINED = 400
+"""Camera frames that are read with their sweeps to find damaged ones, evenly selected."""
+
+
+def find_damaged(recording: RecordingSource, on_progress: Callable[[int, int], None]) -> None:
+    """Reads a recording through, so that it knows of its damaged frames; `on_progress(done, total)` counts images.
+
+    Raises:
+        SourceError: no frame of a kind can be read.
+    """
+    if isinstance(recording, HasGroundTruth):
+        return  # it is simulated while it is read
+    examined = evenly_spread(len(recording.camera_stamps_ns), MOST_EXAMINED)
+    seen = 0
+    for frame in readable(recording.messages(examined), damaged_of(recording)):
+        seen += isinstance(frame, types.CameraFrame)
+        on_progress(seen, len(examined))
+
+
 def fitness_of(recording: RecordingSource) -> Fitness:
     """What a recording holds, and remarks on it.
 
@@ -138,7 +164,7 @@ def fitness_of(recording: RecordingSource) -> Fitness:
     sweeps: list[types.LidarFrame] = []
     motions: list[types.EgoMotion] = []
     image: types.CameraFrame | None = None
-    for message in recording.messages(sampled):
+    for message in readable(recording.messages(sampled), damaged_of(recording)):
         match message:
             case types.CameraFrame():
                 image = message

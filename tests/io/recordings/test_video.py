@@ -6,7 +6,6 @@ from __future__ import annotations
 import base64
 import importlib.util
 import json
-import logging
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from coec.io.images import decode_bgr
 from coec.io.mcap.writer import write_messages
 from coec.io.recordings.bag import BagRecording
 from coec.io.recordings.layouts import open_source
+from coec.io.recordings.recording_source import damaged_of
 from coec.io.ros import messages
 from coec.io.ros.topics import FrameTopics, PairTopics
 from coec.io.video import VideoReader, VideoTrack, codec_of
@@ -242,7 +242,7 @@ def test_the_messages_of_foxglove_and_of_ffmpeg_image_transport(tmp_path: Path, 
     assert shown(with_packets(tmp_path / f"{kind}.mcap", entries, encoding)) == expected
 
 
-def test_pictures_that_cannot_be_decoded_are_counted_by_cause(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_pictures_that_cannot_be_decoded_are_counted_by_cause(tmp_path: Path) -> None:
     packets = [(p.data, p.picture) for p in encoded("libx264", IMAGES)]
     path = Bag(drive_of([*packets[2:6], *packets[7:]])).write(tmp_path / "video.mcap")
     recording = open_source(str(path))
@@ -253,9 +253,10 @@ def test_pictures_that_cannot_be_decoded_are_counted_by_cause(tmp_path: Path, ca
     # A damaged picture of H.265 is noticed only when it is decoded.
     packets = [(p.data, p.picture) for p in encoded("libx265", IMAGES)]
     path = Bag(drive_of([*packets[:2], *packets[3:]], "h265")).write(tmp_path / "h265.mcap")
-    with caplog.at_level(logging.WARNING):
-        assert [number for number, _ in shown(str(path))] == [0, 1, *range(5, 12)]
-    assert "2 pictures of the video could not be decoded" in caplog.text
+    assert [number for number, _ in shown(str(path))] == [0, 1, *range(5, 12)]
+    recording = open_source(str(path))
+    list(recording.messages())
+    assert "2 damaged (2 image_unreadable)" in damaged_of(recording).text
 
 
 def test_a_video_without_a_key_frame_and_one_of_another_codec_are_refused_with_what_to_do(tmp_path: Path) -> None:
@@ -266,7 +267,7 @@ def test_a_video_without_a_key_frame_and_one_of_another_codec_are_refused_with_w
     with pytest.raises(SourceError, match=r"/front/image has video of the format 'av1': H.264 and H.265 are read"):
         open_source(str(path))
     path = Bag(drive_of([(KEY, 0)])).write(tmp_path / "no_data.mcap")
-    with pytest.raises(SourceError, match="none of the first pictures of the video can be decoded"):
+    with pytest.raises(SourceError, match="the picture of the video at 1000000000 ns cannot be decoded"):
         open_source(str(path))
 
 

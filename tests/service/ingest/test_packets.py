@@ -16,7 +16,7 @@ from coec.config import LidarConfig, LimitsConfig
 from coec.io.logs import LossCounter
 from coec.io.recordings.bag_index import CloudDecoder, build_index
 from coec.io.recordings.bag_storage import open_storage
-from coec.io.ros import messages
+from coec.io.ros import message_decoding, messages
 from coec.io.ros.wire_format import MessageAttachment
 from coec.io.zenoh.bus import CDR, InputSample, input_of
 from coec.service.discovery_listener import DiscoveryListener
@@ -40,6 +40,7 @@ from support.packets import (
 )
 from support.pending_pairs import CAMERA, INFO, SAMPLES, TF_STATIC, configured
 from support.recordings import STORE, T_BASE_LIDAR, transform_message
+from support.ros import velodyne_scan
 
 SECOND_NS, SWEEP_NS, TURNS = 10**9, 100_000_000, 6
 BEGIN_NS = 1_700_000_000 * SECOND_NS
@@ -179,6 +180,29 @@ def test_late_lost_damaged_and_foreign_packets_are_counted() -> None:
     for number in range(100, 140):
         sensor.decoder.frame(sample_of(sent[0], number))
     assert sensor.lost["sequence_gap"] > 1
+
+
+@pytest.mark.fault(
+    "a damaged scan of Velodyne's packets on a live topic", "it is counted by its cause; the next is taken"
+)
+def test_live_scans_of_velodyne_are_sweeps() -> None:
+    pytest.importorskip("velodyne_decoder", reason="needs the extra velodyne")
+    sensor = Sensor(frame_id="velodyne", type=messages.VELODYNE_SCAN)
+    scan = velodyne_scan()
+    frame = sensor.decoder.frame(sample_of((BEGIN_NS, "", messages.VELODYNE_SCAN, scan)))
+    expected = message_decoding.decode(messages.VELODYNE_SCAN, scan, LimitsConfig())
+    assert isinstance(frame, LidarFrame)
+    assert isinstance(expected, LidarFrame)
+    for field in ("stamp_ns", "frame_id", "xyz_m", "intensity", "ring", "time_offset_s"):
+        np.testing.assert_array_equal(getattr(frame, field), getattr(expected, field))
+    damaged = [scan[:-1], velodyne_scan(1, packet=bytes(1206)), velodyne_scan(0)]
+    sent: list[Entry] = [(BEGIN_NS, "", messages.VELODYNE_SCAN, data) for data in (*damaged, scan)]
+    assert [sensor.decoder.frame(sample_of(one, number)) is not None for number, one in enumerate(sent, 2)] == [
+        *(False,) * 3,
+        True,
+    ]
+    assert sum(sensor.lost.values()) == len(damaged)
+    assert "decoder_fault" not in sensor.lost
 
 
 @pytest.mark.fault("two LiDARs that send packets on one live topic", "their sweeps are refused: two publishers")

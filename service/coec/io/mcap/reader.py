@@ -4,6 +4,7 @@ The readers of the `mcap` package return short reads as if they were whole, and 
 kB file can become 600 MB). So this module parses the records itself (MCAP specification, "Records").
 """
 
+import bisect
 import struct
 import zlib
 from collections.abc import Iterator
@@ -33,6 +34,7 @@ MAX_ZSTD_WINDOW = 2**27
 _PREFIX = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQI")
+_CHUNK_INDEX = struct.Struct("<QQQ")
 _ATTACHMENT_INDEX = struct.Struct("<QQQQQ")
 _FOOTER = struct.Struct("<QQI")
 _TAIL_BYTES = _PREFIX.size + _FOOTER.size + len(MAGIC)
@@ -111,10 +113,20 @@ class Metadata:
     values: dict[str, str]
 
 
-Record = Schema | Channel | McapMessage | McapAttachment | Metadata
+@dataclass(frozen=True, slots=True)
+class DamagedRecord:
+    """A record that was left out; the error begins with the offset of its byte."""
+
+    at: int
+    error: McapDamagedError
 
 
-def read_records(stream: BinaryIO, *, max_unpacked_bytes: int | None = None) -> Iterator[Record]:
+Record = Schema | Channel | McapMessage | McapAttachment | Metadata | DamagedRecord
+
+
+def read_records(
+    stream: BinaryIO, *, max_unpacked_bytes: int | None = None, skip_damaged: bool = False
+) -> Iterator[Record]:
     """The records of the data section in the order of the file, including those in chunks.
 
     Records yielded before an error are sound, which salvaging a cut file relies on. Only a file that is read to the end
@@ -123,6 +135,8 @@ def read_records(stream: BinaryIO, *, max_unpacked_bytes: int | None = None) -> 
     Args:
         stream: positioned at the start of the file, seekable.
         max_unpacked_bytes: bound on all chunks together, for readers that keep what they are given.
+        skip_damaged: a damaged record in the middle gives a `DamagedRecord`; the next one that the index at the end of
+            the file names is read, with the channels that the index repeats.
 
     Raises:
         McapDamaged: not MCAP, cut off, a wrong CRC or length, or a chunk that would unpack to more than
@@ -131,36 +145,89 @@ def read_records(stream: BinaryIO, *, max_unpacked_bytes: int | None = None) -> 
     size = _size(stream)
     if _read(stream, len(MAGIC), 0, size) != MAGIC:
         raise _no_mcap()
-    crc = zlib.crc32(MAGIC)
+    index = _SummaryIndex.of(stream, size) if skip_damaged else _SummaryIndex()
+    crc: int | None = zlib.crc32(MAGIC)
     unpacked = 0
     at = len(MAGIC)
     while True:
-        prefix = _read(stream, _PREFIX.size, at, size)
-        opcode, length = _PREFIX.unpack(prefix)
-        body_at = at + _PREFIX.size
-        if opcode == Opcode.FOOTER:
-            raise McapDamagedError(f"byte {at}: the data section has no end")
-        body = _read(stream, length, body_at, size)
-        if opcode == Opcode.DATA_END:
-            expected = _Cursor(body, body_at).unpack(struct.Struct("<I"))[0]
-            if expected not in (0, crc):
-                raise McapDamagedError(f"byte {at}: the CRC of the data section does not agree")
-            # What follows is a summary that begins right here (or none), a footer, and nothing else.
-            data_end, (_, summary_at) = body_at + length, _summary(stream, size)
-            if summary_at != data_end:
-                beyond = f"{summary_at - data_end} bytes between the data and the summary belong to neither"
-                raise McapDamagedError(f"byte {data_end}: {beyond}")
-            return
-        crc = zlib.crc32(body, zlib.crc32(prefix, crc))
-        if opcode == Opcode.CHUNK:
+        begin, next_at = at, index.next_after(at)
+        stream.seek(at)
+        try:
+            prefix = _read(stream, _PREFIX.size, at, size)
+            opcode, length = _PREFIX.unpack(prefix)
+            body_at = at + _PREFIX.size
+            if opcode == Opcode.FOOTER:
+                raise McapDamagedError(f"byte {at}: the data section has no end")
+            if next_at is not None and (body_at + length > next_at or opcode == Opcode.DATA_END):
+                raise McapDamagedError(f"byte {at}: a record reaches beyond the begin of the next chunk")
+            if begin in index.chunks_at and opcode != Opcode.CHUNK:
+                raise McapDamagedError(f"byte {at}: the chunk that the index names is none")
+            body = _read(stream, length, body_at, size)
+            at = body_at + length
+            if opcode == Opcode.DATA_END:
+                break
+            crc = None if crc is None else zlib.crc32(body, zlib.crc32(prefix, crc))
+            if opcode != Opcode.CHUNK:
+                yield from _parse(opcode, memoryview(body), body_at, None)
+                continue
             chunk = _unpack_chunk(body, body_at)
             unpacked += len(chunk)
-            if max_unpacked_bytes is not None and unpacked > max_unpacked_bytes:
-                raise McapDamagedError(f"byte {at}: the file unpacks to more than {max_unpacked_bytes} bytes")
-            yield from _chunk_records(chunk, at)
+            if max_unpacked_bytes is None or unpacked <= max_unpacked_bytes:
+                yield from _chunk_records(chunk, begin)
+                continue
+        except McapDamagedError as error:
+            if not skip_damaged or (at == begin and next_at is None):
+                raise
+            crc, at = None, next_at if at == begin and next_at is not None else at
+            yield DamagedRecord(begin, error)
+            yield from index.channels
         else:
-            yield from _parse(opcode, memoryview(body), body_at, None)
-        at = body_at + length
+            raise McapDamagedError(f"byte {begin}: the file unpacks to more than {max_unpacked_bytes} bytes")
+    # What follows is a summary that begins right here (or none), a footer, and nothing else.
+    expected, (_, summary_at) = _Cursor(body, body_at).unpack(struct.Struct("<I"))[0], _summary(stream, size)
+    if summary_at != at:
+        raise McapDamagedError(f"byte {at}: {summary_at - at} bytes between the data and the summary belong to neither")
+    if crc is not None and expected not in (0, crc):
+        disagreement = McapDamagedError(f"byte {begin}: the CRC of the data section does not agree")
+        if not skip_damaged:
+            raise disagreement
+        yield DamagedRecord(begin, disagreement)
+
+
+@dataclass(frozen=True, slots=True)
+class _SummaryIndex:
+    """What the summary repeats of the data: where chunks begin, ascending, and the data ends; schemas and channels."""
+
+    chunks_at: tuple[int, ...] = ()
+    data_end_at: int = 0
+    channels: tuple[Record, ...] = ()
+
+    @classmethod
+    def of(cls, stream: BinaryIO, size: int) -> "_SummaryIndex":
+        """From the end of the file; empty if it has no sound summary."""
+        chunks_at: list[int] = []
+        channels: list[Record] = []
+        try:
+            summary, summary_at = _summary(stream, size)
+            cursor = _Cursor(summary, summary_at)
+            while cursor.left:
+                opcode, length = cursor.unpack(_PREFIX)
+                body, at = cursor.take(length), cursor.at - length
+                if opcode == Opcode.CHUNK_INDEX:
+                    chunks_at.append(_Cursor(body, at).unpack(_CHUNK_INDEX)[2])
+                elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                    channels += _parse(opcode, body, at, None)
+        except McapDamagedError:
+            return cls()
+        data_end_at = summary_at - _PREFIX.size - 4
+        return cls(tuple(sorted(at for at in chunks_at if at < data_end_at)), data_end_at, tuple(channels))
+
+    def next_after(self, at: int) -> int | None:
+        """Where the next chunk behind a byte begins, or the data ends; None if the index names no chunk."""
+        number = bisect.bisect_right(self.chunks_at, at)
+        if number < len(self.chunks_at):
+            return self.chunks_at[number]
+        return self.data_end_at if self.chunks_at and at < self.data_end_at else None
 
 
 class MessageReader:

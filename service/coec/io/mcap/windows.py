@@ -179,6 +179,11 @@ class WindowContent:
         except ValidationError as error:
             raise WindowError(f"{path}: {CONFIGURATION}: {describe(error)}") from error
 
+    def is_whole(self, key: PairKey, *, with_motion: bool) -> bool:
+        """Whether the pair at a place has both its frames, and its motion."""
+        parts = self.parts[key]
+        return None not in (parts.camera, parts.lidar) and not (with_motion and parts.motion is None)
+
     def pair(self, path: Path, key: PairKey) -> FramePair:
         """Removes and returns the pair at a place."""
         parts = self.parts.pop(key)
@@ -200,7 +205,8 @@ class WindowContent:
         try:
             frame = message_decoding.decode(schema.name, message.data, _LIMITS, point_time=WRITTEN_TIME)
         except DecodeError as error:
-            raise WindowError(f"a message on {channel.topic} cannot be decoded: {error}") from error
+            what = f"message {message.sequence} on {channel.topic} cannot be decoded"
+            raise WindowError(f"{what}: {error}") from error
         key = PairKey(is_between(channel.topic), message.sequence)
         parts = self.parts.setdefault(key, _Parts())
         match frame:
@@ -223,28 +229,44 @@ MAX_UNPACKED = 64
 a sixtieth."""
 
 
-def read_window(path: Path) -> tuple[Window, CalibrationConfig]:
+def read_window(
+    path: Path, on_damaged: Callable[[object, WindowError], None] | None = None
+) -> tuple[Window, CalibrationConfig]:
     """The window exactly as it was recorded, and the configuration that it was recorded for.
+
+    Args:
+        path: of the file.
+        on_damaged: takes the place of each damaged record or message, and why it is left out with its pair; None: the
+            first of them is raised.
 
     Raises:
         WindowError: unreadable, cut off, damaged, not a window of coec, or without a pair.
     """
-    content = WindowContent()
-    size = _size(path)
-    for record in records_of(path, max_unpacked_bytes=size * MAX_UNPACKED + mcap_writer.CHUNK_BYTES):
-        content.add(record)
+    content, damaged = WindowContent(), False
+    limit = _size(path) * MAX_UNPACKED + mcap_writer.CHUNK_BYTES
+    for record in records_of(path, limit, skip_damaged=on_damaged is not None):
+        try:
+            if isinstance(record, reader.DamagedRecord):
+                raise WindowError(f"{path}: {record.error}")
+            content.add(record)
+        except WindowError as error:
+            if on_damaged is None:
+                raise
+            damaged = True
+            on_damaged((record.chunk_at, record.at) if isinstance(record, McapMessage) else str(error), error)
     rig, T_camera_lidar_start, window_id = content.head(path)
-    places = sorted(content.parts)
-    pairs, between = (
-        tuple(
-            sorted((content.pair(path, of) for of in places if of.between == thinned), key=lambda pair: pair.stamp_ns)
-        )
-        for thinned in (False, True)
-    )
+    pairs: list[FramePair] = []
+    between: list[FramePair] = []
+    with_motion = damaged and any(parts.motion is not None for parts in content.parts.values())
+    for key in sorted(content.parts):
+        if not damaged or content.is_whole(key, with_motion=with_motion):
+            (between if key.between else pairs).append(content.pair(path, key))
     if not pairs:
-        raise WindowError(f"{path} holds no camera-LiDAR pair")
+        raise WindowError(f"{path} holds no camera-LiDAR pair{' that is not damaged' if damaged else ''}")
+    pairs.sort(key=lambda pair: pair.stamp_ns)
+    between.sort(key=lambda pair: pair.stamp_ns)
     # The service began the window at the extrinsic in use, which is off by about `MOUNT_RAD`.
-    window = Window(window_id, rig, T_camera_lidar_start, pairs, MOUNT_RAD, between)
+    window = Window(window_id, rig, T_camera_lidar_start, tuple(pairs), MOUNT_RAD, tuple(between))
     return window, content.parsed_configuration(path)
 
 
@@ -317,15 +339,17 @@ def is_window(path: Path) -> bool:
         raise SourceError(error.of(path)) from error
 
 
-def records_of(path: Path, max_unpacked_bytes: int | None = None) -> Iterator[reader.Record]:
-    """The records of a window's file; those before an error are sound.
+def records_of(
+    path: Path, max_unpacked_bytes: int | None = None, *, skip_damaged: bool = False
+) -> Iterator[reader.Record]:
+    """The records of a window's file; those before an error are sound. `skip_damaged` as in `read_records`.
 
     Raises:
         WindowError: unreadable, cut off or damaged.
     """
     try:
         with path.open("rb") as stream:
-            yield from reader.read_records(stream, max_unpacked_bytes=max_unpacked_bytes)
+            yield from reader.read_records(stream, max_unpacked_bytes=max_unpacked_bytes, skip_damaged=skip_damaged)
     except OSError as error:
         raise WindowError(f"cannot read {path}: {error.strerror}") from error
     except reader.McapDamagedError as error:

@@ -5,10 +5,11 @@ A bag is read through once for its index (`index`); each message is read again w
 
 from __future__ import annotations
 
-import logging
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,16 +24,11 @@ from coec.io.recordings.bag_recognition import PairMessages, Sweep, lidar_frame_
 from coec.io.recordings.bag_storage import BagReader, BagStorage, open_storage
 from coec.io.recordings.clocks import header_clock_text
 from coec.io.recordings.cloud_files import measured_from
-from coec.io.recordings.recording_source import evenly_spread
+from coec.io.recordings.recording_source import CLOUD, IMAGE, KINDS, MOTION, RECORD, DamagedFrames, evenly_spread
 from coec.io.ros import message_decoding, messages
 from coec.io.ros.topics import TopicInfo, TopicMessage
 from coec.io.ros.transforms import bare
 from coec.io.video import MAX_PIXELS, VideoReader, VideoTrack
-
-LOG = logging.getLogger(__name__)
-
-FIRST_IMAGES = 64
-"""Pictures of a video among which one has to be decodable."""
 
 _EGO, _LIDAR, _CAMERA = 0, 1, 2
 """Order of messages with equal stamps, as in `sources.recording`."""
@@ -98,6 +94,8 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
     index = bag_index.build_index(storage, clouds, query.get("metadata"))
     camera_topic = index.camera_topic(query.get("camera"))
     lidar_topic = index.lidar_topic(query.get("points"))
+    for topic in (camera_topic, lidar_topic):
+        index.require_stamps(topic)
     index.require_one_frame(camera_topic, query.get("camera_frame"), "camera_frame")
     index.require_one_frame(lidar_topic, query.get("lidar_frame"), "lidar_frame")
     with storage.open() as reader:
@@ -109,14 +107,21 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
             (frames, query.get("odometry"), query.get("odometry_frame")),
             readings,
         )
-        camera = _first_image(spec.path, _Images(storage, reader, streams.video), streams.camera)
-        cloud = _load(storage, reader, streams.lidar[0].clouds[0], clouds)
-        motions = [*streams.moved[:1], *(_load(storage, reader, place, clouds) for place in streams.motion[:1])]
-        motion = motions[0] if motions else None
-        of_images = None if streams.video is not None else _of_images(_Images(storage, reader, None), streams.camera)
+        images = _Images(storage, reader, streams.video, index.damaged)
+
+        def first(kind: str, places: Sequence[bag_index.MessageLocation]) -> Frame | None:
+            loaded = ((kind, p.stamp_ns, partial(_load, storage, reader, p, clouds)) for p in places)
+            return next(index.damaged.sound(loaded), None)
+
+        camera = next(images.sound(streams.camera), None)
+        cloud = first(CLOUD, [sweep.clouds[0] for sweep in streams.lidar])
+        motion = streams.moved[0] if streams.moved else first(MOTION, streams.motion)
+        of_images = None if streams.video is not None else _of_images(images.sound(_middle(streams.camera)))
+        if not (
+            isinstance(camera, CameraFrame) and isinstance(cloud, LidarFrame) and isinstance(motion, EgoMotion | None)
+        ):
+            raise SourceError(f"{spec.path}: {camera_topic} holds no images, or no motion on the topic named for it")
         of_transforms = index.connect(query.get("camera_frame", camera.frame_id), cloud.frame_id, reader)
-    if not (isinstance(camera, CameraFrame) and isinstance(cloud, LidarFrame) and isinstance(motion, EgoMotion | None)):
-        raise SourceError(f"{spec.path}: {camera_topic} holds no images, or no motion on the topic named for it")
     pair = PairMessages(camera_topic, camera, cloud, motion, query.get("intrinsics"), query.get("camera_frame"))
     rig, T_cloud_lidar, of_rig = _rig(index, pair, query)
     if motion is not None and any(one.code == MOTION_LEFT_OUT for one in of_rig):
@@ -132,7 +137,9 @@ def open_bag(spec: recording_source.SourceSpec) -> recording_source.RecordingSou
         *(() if of_twists is None else (of_twists,)),
     )
     name, start = f"{spec.path.name}{camera_topic}", rig.T_camera_lidar_nominal
-    recording = BagRecording(name, rig, start, storage, streams, T_cloud_lidar, clouds, readings, recognitions)
+    recording = BagRecording(
+        name, rig, start, storage, streams, T_cloud_lidar, clouds, readings, recognitions, damaged=index.damaged
+    )
     return recording.recognised()
 
 
@@ -174,7 +181,8 @@ def _connected(
 
 
 def _window_recording(path: Path) -> recording_source.FramewiseRecording:
-    window, configuration = read_window(path)
+    damaged = DamagedFrames()
+    window, configuration = read_window(path, partial(damaged.add, RECORD))
 
     def frame_of(pair: FramePair) -> recording_source.RecordedFrame:
         return recording_source.RecordedFrame(
@@ -188,6 +196,7 @@ def _window_recording(path: Path) -> recording_source.FramewiseRecording:
         tuple(frame_of(pair) for pair in window.pairs),
         tuple(pair.motion for pair in window.pairs if pair.motion is not None),
         configuration,
+        damaged=damaged,
     )
 
 
@@ -226,6 +235,7 @@ class BagRecording:
         readings: what a person said of the bag.
         recognitions: what was recognised of the bag.
         compensated: instant for which the points were compensated before they were recorded; None: for none.
+        damaged: what cannot be read, and is left out.
     """
 
     name: str
@@ -239,6 +249,7 @@ class BagRecording:
     recognitions: tuple[Recognition, ...] = ()
     compensated: str | None = None
     configuration: CalibrationConfig | None = None
+    damaged: DamagedFrames = field(default_factory=DamagedFrames)
 
     @property
     def camera_stamps_ns(self) -> tuple[int, ...]:
@@ -277,22 +288,24 @@ class BagRecording:
         ]
         checked: LidarFrame | None = None
         with self.storage.open() as reader:
-            images = _Images(self.storage, reader, self.streams.video)
-            for _, kind, _, item in sorted(queue, key=lambda entry: entry[:3]):
-                if isinstance(item, EgoMotion):
-                    yield item
-                elif isinstance(item, Sweep):
-                    if checked is not None and checked.stamp_ns // PERIOD_NS != item.stamp_ns // PERIOD_NS:
-                        checked = None
-                    sweep = self._sweep(reader, item, checked)
-                    checked = checked or sweep
-                    yield sweep
-                elif kind != _CAMERA:
-                    yield _load(self.storage, reader, item, self.clouds)
-                elif (image := images.load(item)) is not None:
-                    yield image
-        if images.not_decoded:
-            LOG.warning("%s: %d pictures of the video could not be decoded", self.name, images.not_decoded)
+            images = _Images(self.storage, reader, self.streams.video, self.damaged)
+
+            def load(kind: int, item: bag_index.MessageLocation | EgoMotion) -> Frame:
+                nonlocal checked
+                if isinstance(item, EgoMotion) or kind == _EGO:
+                    return self._motion(reader, item)
+                if not isinstance(item, Sweep):
+                    return images.load(item)
+                if checked is not None and checked.stamp_ns // PERIOD_NS != item.stamp_ns // PERIOD_NS:
+                    checked = None
+                sweep = self._sweep(reader, item, checked)
+                checked = checked or sweep
+                return sweep
+
+            ordered = sorted(queue, key=lambda entry: entry[:3])
+            yield from self.damaged.sound(
+                (KINDS[kind], stamp_ns, partial(load, kind, item)) for stamp_ns, kind, _, item in ordered
+            )
 
     def recognised(self) -> BagRecording:
         """The recording with its sweeps as their points show them: clouds that are parts of a turn are joined, and
@@ -304,8 +317,9 @@ class BagRecording:
         readings = self.readings
         with self.storage.open() as reader:
 
-            def load(place: bag_index.MessageLocation) -> LidarFrame:
-                return self._cloud(reader, place)
+            def load(place: bag_index.MessageLocation) -> Iterator[LidarFrame]:
+                with suppress(SourceError):  # it is told when it is used
+                    yield self._cloud(reader, place)
 
             clouds = [cloud for sweep in self.streams.lidar for cloud in sweep.clouds]
             sweeps, of_clouds = bag_recognition.sweeps_of_clouds(clouds, load, readings.clouds)
@@ -322,25 +336,33 @@ class BagRecording:
 
     def _is_unordered(self, reader: BagReader) -> bool:
         """Whether ring numbers are no scan lines, by two sweeps: to look for the cones of each takes time."""
-        sweeps = self.streams.lidar
-        inspected = [self._sweep(reader, sweeps[index]) for index in evenly_spread(len(sweeps), 2)]
+        inspected = [*self._sampled(reader, 2)]
         return bool(inspected) and all(NO_SCAN_LINES in sweep.recognitions for sweep in inspected)
 
     def _compensated(self, reader: BagReader) -> tuple[str | None, Recognition | None]:
         """See `bag_recognition.compensated`, of some sweeps."""
-        sweeps = self.streams.lidar
-        sampled = [sweeps[index] for index in evenly_spread(len(sweeps), bag_recognition.SAMPLED_SWEEPS)]
-        stamps_ns = [sweep.stamp_ns for sweep in sampled]
-        motions = [
-            motion if isinstance(motion, EgoMotion) else _load(self.storage, reader, motion, self.clouds)
+        if not self.streams.motions:
+            return None, None
+        sampled = [*self._sampled(reader, bag_recognition.SAMPLED_SWEEPS)]
+        near = [
+            motion
             for motion in self.streams.motions
-            if any(abs(motion.stamp_ns - stamp_ns) <= recording_source.MOTION_REACH_NS // 5 for stamp_ns in stamps_ns)
+            if any(abs(motion.stamp_ns - s.stamp_ns) <= recording_source.MOTION_REACH_NS // 5 for s in sampled)
         ]
-        known = [motion for motion in motions if isinstance(motion, EgoMotion)]
+        loaded = self.damaged.sound((MOTION, place.stamp_ns, partial(self._motion, reader, place)) for place in near)
+        known = [motion for motion in loaded if isinstance(motion, EgoMotion)]
         if not known:
             return None, None
-        loaded = (self._sweep(reader, sweep) for sweep in sampled)
-        return bag_recognition.compensated(loaded, known, self.rig.T_lidar_ego)
+        return bag_recognition.compensated(sampled, known, self.rig.T_lidar_ego)
+
+    def _motion(self, reader: BagReader, motion: bag_index.MessageLocation | EgoMotion) -> Frame:
+        return motion if isinstance(motion, EgoMotion) else _load(self.storage, reader, motion, self.clouds)
+
+    def _sampled(self, reader: BagReader, count: int) -> Iterator[LidarFrame]:
+        """Some sweeps, evenly selected, without damaged ones."""
+        sweeps = self.streams.lidar
+        selected = (sweeps[index] for index in evenly_spread(len(sweeps), count))
+        return self.damaged.sound((CLOUD, place.stamp_ns, partial(self._sweep, reader, place)) for place in selected)
 
     def _cloud(self, reader: BagReader, place: bag_index.MessageLocation) -> LidarFrame:
         cloud = _load(self.storage, reader, place, self.clouds)
@@ -449,16 +471,22 @@ def _frames(text: str | None) -> tuple[str, str]:
 class _Images:
     """Loads the images of a topic, each a message, or a packet of video."""
 
-    def __init__(self, storage: BagStorage, reader: BagReader, video: VideoTrack | None) -> None:
-        self._storage, self._reader, self.not_decoded = storage, reader, 0
+    def __init__(
+        self, storage: BagStorage, reader: BagReader, video: VideoTrack | None, damaged: DamagedFrames
+    ) -> None:
+        self._storage, self._reader, self._damaged = storage, reader, damaged
         self._video = None if video is None else VideoReader(video, self._packet, bag_index.LIMITS)
         self._type_name = ""
 
-    def load(self, place: bag_index.MessageLocation) -> Frame | None:
-        """The image of a message, with the stamp of its place; None if it is of a video and cannot be decoded.
+    def sound(self, places: Iterable[bag_index.MessageLocation]) -> Iterator[Frame]:
+        """The images of these places, without damaged ones."""
+        return self._damaged.sound((IMAGE, place.stamp_ns, partial(self.load, place)) for place in places)
+
+    def load(self, place: bag_index.MessageLocation) -> Frame:
+        """The image of a message, with the stamp of its place.
 
         Raises:
-            SourceError: the message holds no image.
+            SourceError: the message holds no image, or its picture cannot be decoded.
         """
         if self._video is None:
             frame = _load(self._storage, self._reader, place, bag_index.CloudDecoder())
@@ -469,8 +497,10 @@ class _Images:
         except DecodeError as error:
             raise SourceError(f"{self._storage.path}: the video at {place.stamp_ns} ns: {error}") from error
         if image is None:
-            self.not_decoded += 1
-            return None
+            raise SourceError(
+                f"{self._storage.path}: the picture of the video at {place.stamp_ns} ns cannot be decoded: it is "
+                f"damaged, or larger than {MAX_PIXELS} pixels"
+            )
         return CameraFrame(place.stamp_ns, place.frame_id, image)
 
     def _packet(self, at: tuple[int, ...]) -> bytes:
@@ -478,24 +508,16 @@ class _Images:
         return b"" if video is None else video[1]
 
 
-def _first_image(path: Path, images: _Images, places: Sequence[bag_index.MessageLocation]) -> Frame:
-    """The first image that can be decoded."""
-    for place in places[:FIRST_IMAGES]:
-        image = images.load(place)
-        if image is not None:
-            return image
-    raise SourceError(
-        f"{path}: none of the first pictures of the video can be decoded: it is damaged, or larger than {MAX_PIXELS} "
-        "pixels"
-    )
-
-
-def _of_images(images: _Images, places: Sequence[bag_index.MessageLocation]) -> Recognition | None:
-    """What to tell of images in the middle of a recording."""
+def _middle(places: Sequence[bag_index.MessageLocation]) -> Sequence[bag_index.MessageLocation]:
+    """Some in a row, in the middle of a recording."""
     begin = max(0, (len(places) - bag_recognition.COMPARED_IMAGES) // 2)
-    loaded = map(images.load, places[begin : begin + bag_recognition.COMPARED_IMAGES])
+    return places[begin : begin + bag_recognition.COMPARED_IMAGES]
+
+
+def _of_images(images: Iterable[Frame]) -> Recognition | None:
+    """What to tell of images in a row."""
     try:
-        return bag_recognition.alternating_cameras([one for one in loaded if isinstance(one, CameraFrame)])
+        return bag_recognition.alternating_cameras([one for one in images if isinstance(one, CameraFrame)])
     except (DecodeError, SourceError):
         return None  # it is reported when it is used
 

@@ -11,11 +11,11 @@ import struct
 import sys
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final
 
 import numpy as np
 from pydantic import ValidationError
@@ -24,6 +24,7 @@ from coec.calibration.types import EgoMotion, Frame, Matrix4, Recognition
 from coec.config import LimitsConfig, PointTimeConfig, describe
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.io.recordings.bag_storage import MAX_MESSAGE_BYTES, BagMessage, BagReader, BagStorage
+from coec.io.recordings.recording_source import CLOUD, IMAGE, MOTION, RECORD, DamagedFrames
 from coec.io.ros import camera_info, message_decoding, messages, packed_clouds, packet_streams, point_clouds
 from coec.io.ros import transforms as ros_transforms
 from coec.io.ros.packet_streams import MAX_DESCRIPTION_BYTES, PacketStream, PacketSweep
@@ -92,10 +93,17 @@ CLOUD_TYPES = (*POINT_TYPES, *packed_clouds.TYPES, *packet_streams.TYPES)
 VELOCITY_TYPES = (messages.ODOMETRY, messages.TWIST, messages.TWIST_WITH_COVARIANCE)
 ROTATION_TYPES = (messages.IMU,)
 
-T = TypeVar("T")
+_USED: Final = (*IMAGE_TYPES, *CLOUD_TYPES, *VELOCITY_TYPES, *ROTATION_TYPES, messages.CAMERA_INFO, messages.TF)
+_KINDS: Final = {IMAGE: IMAGE_TYPES, CLOUD: CLOUD_TYPES, MOTION: (*VELOCITY_TYPES, *ROTATION_TYPES)}
 
 MAX_TF_MESSAGES: Final = 10_000
 """Most messages of transforms of a topic that are looked at for constant ones."""
+
+FEW: Final = 10
+"""Messages of a topic from which on one that is unlike all others is a damaged one."""
+
+STRAY_S: Final = 10.0
+"""Stamps are farther from the times of receipt than those of other messages only if they are damaged, s."""
 
 MAX_FORMAT: Final = 40
 """Most characters of the format of a video in a message."""
@@ -161,6 +169,7 @@ class BagIndex:
         transforms_at: places of the messages of all other transforms, by topic, in the order in the bag.
         packets: messages of packets by topic, until `resolve_packets` makes streams of them.
         descriptions: messages in which LiDARs say what they are, by topic (see `packet_streams.description_name`).
+        damaged: what cannot be read, and is left out.
     """
 
     path: Path
@@ -172,6 +181,7 @@ class BagIndex:
     unread: dict[str, str] = field(default_factory=dict)
     packets: dict[str, PacketStream] = field(default_factory=dict)
     descriptions: dict[str, bytes] = field(default_factory=dict)
+    damaged: DamagedFrames = field(default_factory=DamagedFrames)
 
     def topic(self, types: tuple[str, ...], requested: str | None, key: str) -> str:
         """The topic of these types that was asked for, else the only one.
@@ -184,7 +194,8 @@ class BagIndex:
             advice = "".join(f"; {other} has {text}" for other, text in self.unread.items())
             others = (*point_clouds.TYPES, *VIDEO_TYPES, *packed_clouds.TYPES, *packet_streams.TYPES)
             named = " or ".join(name for name in types if name not in others)
-            raise SourceError(f"{self.path} has no message of type {named}{advice}")
+            damaged = f"; {self.damaged.text}" if self.damaged else ""
+            raise SourceError(f"{self.path} has no message of type {named}{advice}{damaged}")
         return topic
 
     def optional_topic(self, types: tuple[str, ...], requested: str | None, key: str) -> str | None:
@@ -257,6 +268,12 @@ class BagIndex:
         """
         stream = self.streams[topic]
         frames = stream.frames
+        # A sensor that sent so little is none: its name is a damaged one.
+        odd = {frame for frame, count in frames.items() if count == 1 and frames.total() >= FEW}
+        if odd and len(odd) < len(frames):
+            text = f"a message on {topic} names the frame {min(odd)!a}, as no other does"
+            self._leave_out(stream, [ros_transforms.bare(one.frame_id) not in odd for one in stream.locations], text)
+            frames = stream.frames
         if len(frames) < 2:
             return
         if requested is None or ros_transforms.bare(requested) not in frames:
@@ -270,6 +287,27 @@ class BagIndex:
             for location in stream.locations
             if ros_transforms.bare(location.frame_id) == ros_transforms.bare(requested)
         ]
+
+    def require_stamps(self, topic: str) -> None:
+        """Leaves out the few messages of a topic whose stamps are far from when they were received, other than all
+        others; their headers are damaged."""
+        stream = self.streams[topic]
+        if stream.type_name in VIDEO_TYPES or len(stream.locations) != len(stream.lags_s) or len(stream.lags_s) < FEW:
+            return
+        lags_s = np.array(stream.lags_s)
+        sound = np.abs(lags_s - np.median(lags_s)) <= STRAY_S
+        if 0 < np.count_nonzero(~sound) <= max(1, len(lags_s) // 50):
+            stamp_ns = stream.locations[int(np.argmin(sound))].stamp_ns
+            text = f"a message on {topic} has the stamp {stamp_ns} ns, far from the time of its receipt"
+            self._leave_out(stream, sound.tolist(), text)
+
+    def _leave_out(self, stream: TopicStream, sound: Sequence[bool], text: str) -> None:
+        """Leaves the messages of a stream that are `sound`."""
+        for location, is_sound in zip(stream.locations, sound, strict=True):
+            if not is_sound:
+                kind = next((kind for kind, types in _KINDS.items() if stream.type_name in types), RECORD)
+                self.damaged.add(kind, location.at, SourceError(f"{self.path}: {text}"))
+        stream.locations = [one for one, is_sound in zip(stream.locations, sound, strict=True) if is_sound]
 
     def connect(self, target: str, source: str, reader: BagReader) -> tuple[Recognition, ...]:
         """If the static transforms do not connect two frames, adds those of other topics (`/tf`) that never change,
@@ -301,20 +339,20 @@ class BagIndex:
             self.transforms.add(tuple(j for j in fresh if not {j.parent, j.child} <= known_frames))
 
     def add(self, entry: BagMessage) -> None:
-        """Notes a message.
-
-        Raises:
-            SourceError: the message is not what its topic says.
-        """
+        """Notes a message, or that it is damaged."""
         name = entry.type_name
-        if name in packet_streams.TYPES:
+        if entry.error is not None:
+            self._note_damage(entry, entry.error)
+        elif name in packet_streams.TYPES:
             stream_of_packets = self.packets.setdefault(entry.topic, PacketStream(entry.topic, name))
             stream_of_packets.add(entry.data, entry.place, entry.logged_ns)
         elif name in (*IMAGE_TYPES, *CLOUD_TYPES, *VELOCITY_TYPES, *ROTATION_TYPES):
             stream = self.streams.setdefault(entry.topic, TopicStream(name))
             stamp_ns = _header_stamp_ns(entry.data)
             if stamp_ns is None:
-                raise SourceError(f"{self.path}: a message on {entry.topic} has no valid header")
+                error = SourceError(f"{self.path}: a message on {entry.topic} has no valid header")
+                self._note_damage(entry, error)
+                return
             if name == messages.POINT_CLOUD and messages.is_empty_cloud(entry.data):
                 stream.empty += 1
                 return
@@ -330,11 +368,12 @@ class BagIndex:
             if name in self.descriptions or len(self.descriptions) < LISTED:
                 self.descriptions[name] = entry.data
         elif name == messages.CAMERA_INFO:
-            self._decoded(entry, self.infos.setdefault(entry.topic, camera_info.CameraInfos()).add)
+            infos = self.infos.get(entry.topic, camera_info.CameraInfos())
+            self._decoded(entry, infos.add)
+            if infos.count:
+                self.infos[entry.topic] = infos
         elif name == messages.TF and entry.topic == TF_STATIC:
-            decoded = self._decoded(entry, ros_transforms.decode_static_transforms)
-            self.transforms.refuse(decoded.refused)
-            self._decoded(entry, lambda _: self.transforms.add(decoded.joints))
+            self._decoded(entry, self._add_static_transforms)
         elif name in message_decoding.REFUSED and name != messages.TF:
             self.leave_unread(entry.topic, f"{name}: {message_decoding.REFUSED[name]}")
         elif name == messages.TF:
@@ -391,11 +430,23 @@ class BagIndex:
         except DecodeError:
             return 0
 
-    def _decoded(self, entry: BagMessage, decode: Callable[[bytes], T]) -> T:
+    def _add_static_transforms(self, data: bytes) -> None:
+        decoded = ros_transforms.decode_static_transforms(data)
+        self.transforms.refuse(decoded.refused)
+        self.transforms.add(decoded.joints)
+
+    def _decoded(self, entry: BagMessage, decode: Callable[[bytes], None]) -> None:
         try:
-            return decode(entry.data)
+            decode(entry.data)
         except DecodeError as error:
-            raise SourceError(f"{self.path}: a {entry.type_name} on {entry.topic} is refused: {error}") from error
+            refused = SourceError(f"{self.path}: a {entry.type_name} on {entry.topic} is refused: {error}")
+            refused.__cause__ = error
+            self._note_damage(entry, refused)
+
+    def _note_damage(self, entry: BagMessage, error: SourceError) -> None:
+        kind = next((kind for kind, types in _KINDS.items() if entry.type_name in types), RECORD)
+        if entry.type_name in _USED or not entry.topic:
+            self.damaged.add(kind, entry.place, error)
 
 
 def video_left_out(track: VideoTrack) -> str:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -33,7 +33,7 @@ from coec.geometry.projection import share_in_image
 from coec.io.frame_validation import MAX_SPEED
 from coec.io.images import decode_grey_reduced
 from coec.io.intrinsics_files import load_camera_document, with_camera
-from coec.io.recordings.bag_index import LIMITS, LISTED, BagIndex, MessageLocation
+from coec.io.recordings.bag_index import FEW, LIMITS, LISTED, BagIndex, MessageLocation
 from coec.io.recordings.bag_storage import METADATA, BagReader
 from coec.io.recordings.recording_source import MOTION_REACH_NS, evenly_spread
 from coec.io.rig_files import camera_of, load_mask, rigid_matrix
@@ -160,16 +160,20 @@ def motions_of_one_frame(
     """The messages of motion that are expressed in one frame: the one that was asked for, if there are several.
 
     Raises:
-        SourceError: some of them name several frames, and none of these was asked for; or one is damaged.
+        SourceError: some of them name several frames, and none of these was asked for.
     """
 
-    def frame_of(place: MessageLocation) -> str:
+    def frame_of(place: MessageLocation) -> str | None:
         if place.type_name != messages.ODOMETRY:
             return bare(place.frame_id)
-        return bare(_posed(reader, place).motion.frame_id)
+        posed = _posed(reader, place)
+        return None if posed is None else bare(posed.motion.frame_id)
 
     sampled = [index for start in evenly_spread(len(places), SAMPLED_MOVES) for index in (start, start + 1)]
-    counts = Counter(frame_of(places[index]) for index in sampled if index < len(places))
+    named = (frame_of(places[index]) for index in sampled if index < len(places))
+    counts = Counter(frame for frame in named if frame is not None)
+    # As in `BagIndex.require_one_frame`.
+    counts = Counter({frame: count for frame, count in counts.items() if count > 1 or counts.total() < FEW})
     if len(counts) < 2:
         return list(places)
     if requested is None or bare(requested) not in counts:
@@ -186,15 +190,12 @@ def motion_of_odometry(
 ) -> tuple[tuple[EgoMotion, ...] | None, Recognition | None]:
     """The motion by the poses of an odometry, if its velocities are not meant as stated or `motion` is `pose`; None:
     by its velocities. And what to tell.
-
-    Raises:
-        SourceError: a message is no odometry.
     """
     if motion == "twist":
         return None, None
     if motion == "pose":
         return _by_poses(reader, places), None
-    sampled = [_posed(reader, places[index]) for index in _near_each_other(places)]
+    sampled = [one for index in _near_each_other(places) if (one := _posed(reader, places[index])) is not None]
     reading = evidence.reading_of_twists(sampled)
     if reading is evidence.TwistReading.AS_STATED:
         return None, None
@@ -213,7 +214,8 @@ def motion_of_odometry(
 
 def _by_poses(reader: BagReader, places: Sequence[MessageLocation]) -> tuple[EgoMotion, ...]:
     """The motion by the poses, without jumps that no vehicle makes."""
-    motions = evidence.motions_of_poses([_posed(reader, place) for place in places])
+    posed = [one for place in places if (one := _posed(reader, place)) is not None]
+    motions = evidence.motions_of_poses(posed)
     return tuple(
         motion for motion in motions if max(map(abs, (*(motion.linear_mps or ()), *motion.angular_radps))) <= MAX_SPEED
     )
@@ -230,12 +232,13 @@ def _near_each_other(places: Sequence[MessageLocation]) -> list[int]:
     return sorted(selected)
 
 
-def _posed(reader: BagReader, place: MessageLocation) -> evidence.PoseAndTwist:
+def _posed(reader: BagReader, place: MessageLocation) -> evidence.PoseAndTwist | None:
+    """Pose and velocity of a message; None if it is damaged, which is told when it is used."""
     payload = reader.read(place.at)
     try:
         return evidence.PoseAndTwist(odometry_pose(payload), message_decoding.odometry(payload))
-    except DecodeError as error:
-        raise SourceError(f"the {messages.ODOMETRY} of {place.stamp_ns} ns: {error}") from error
+    except DecodeError:
+        return None
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -247,19 +250,19 @@ class Sweep(MessageLocation):
 
 
 def sweeps_of_clouds(
-    places: Sequence[MessageLocation], load: Callable[[MessageLocation], LidarFrame], clouds: int | None
+    places: Sequence[MessageLocation], load: Callable[[MessageLocation], Iterator[LidarFrame]], clouds: int | None
 ) -> tuple[list[Sweep], tuple[Recognition, ...]]:
     """The sweeps that clouds make up, each alone or some of them a turn; and what to tell.
 
     Args:
         places: of the clouds, in the order of their stamps.
-        load: a cloud.
+        load: a cloud; nothing if it is damaged.
         clouds: how many clouds make up a sweep; None: it is recognised.
     """
     alone = [Sweep(place.stamp_ns, place.at, place.type_name, clouds=(place,)) for place in places]
     if clouds is not None:
         return (alone if clouds == 1 else _joined(places, clouds)), ()
-    seen = [load(place) for place in places[:FEW_CLOUDS]]
+    seen = [cloud for place in places[:FEW_CLOUDS] for cloud in load(place)]
     if _overlap(seen):
         text = (
             "The clouds of the topic overlap in time: perhaps two LiDARs publish on it, and each needs its own; "
@@ -269,7 +272,7 @@ def sweeps_of_clouds(
     # A LiDAR that does not turn shows the same sectors at once.
     if not seen or evidence.sectors(seen[0]).sum() >= evidence.WHOLE * evidence.SECTORS or not _turning(seen):
         return alone, ()
-    seen += [load(place) for place in places[len(seen) : evidence.MOST_CLOUDS]]
+    seen += [cloud for place in places[FEW_CLOUDS : evidence.MOST_CLOUDS] for cloud in load(place)]
     in_turn = evidence.clouds_in_turn([evidence.sectors(one) for one in seen])
     if in_turn == 1:
         return alone, ()
@@ -540,6 +543,7 @@ def unconnected_text(index: BagIndex, target: str, source: str) -> str:
         "give ?intrinsics=FILE with `camera:` (which may name a camera_info.yaml) and `T_camera_lidar:` as in a "
         f"dataset.yaml, or name the frames with ?camera_frame= and ?lidar_frame=; there: {listed or 'none'}"
         + (f"; left out: {left_out}" if left_out else "")
+        + (f"; {index.damaged.text}" if index.damaged else "")
         + part_of_bag_text(index.path)
     )
 
@@ -563,7 +567,7 @@ def _lens_of(index: BagIndex, pair: PairMessages) -> _Lens:
             info, recognised = _info(index, pair)
             lens = camera_info.intrinsics_of_info(info, rectified=rectified)
         except SourceError as error:
-            part = part_of_bag_text(index.path)
+            part = part_of_bag_text(index.path) + (f"; {index.damaged.text}" if index.damaged else "")
             raise SourceError(f"the camera info of {index.path}: {error}; give ?intrinsics=FILE{part}") from error
         if lens.is_adapted:
             text = f"The lens is that of {lens.source}; give ?intrinsics=FILE if the images are not so."

@@ -11,6 +11,7 @@ Files that are packed as a whole (`compression_mode: FILE`) are unpacked into th
 when the recording is no longer used.
 """
 
+import bisect
 import bz2
 import re
 import shutil
@@ -20,7 +21,7 @@ import tempfile
 import weakref
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Protocol
@@ -49,6 +50,7 @@ class BagMessage:
         data: the message in CDR.
         logged_ns: when the recorder got the message, by its own clock.
         place: where the message lies; only the storage that gave it can use it.
+        error: why the message is damaged, which then has no data. Without a topic, it is a record of the container.
     """
 
     topic: str
@@ -56,6 +58,12 @@ class BagMessage:
     data: bytes
     logged_ns: int
     place: tuple[int, ...]
+    error: SourceError | None = None
+
+    @classmethod
+    def damaged(cls, at: int, error: SourceError) -> "BagMessage":
+        """A damaged record of the container, which begins at this byte."""
+        return cls("", "", b"", 0, (at,), error)
 
 
 class BagReader(Protocol):
@@ -83,10 +91,10 @@ class BagStorage(Protocol):
         ...
 
     def entries(self) -> Iterator[BagMessage]:
-        """All CDR messages, in the order in which they lie in the bag.
+        """All CDR messages, in the order in which they lie in the bag; also those that are damaged.
 
         Raises:
-            SourceError: a file is absent, cut off or damaged; names it.
+            SourceError: a file is absent, cut off, or so damaged that what follows cannot be read; names it.
         """
         ...
 
@@ -115,8 +123,10 @@ class McapStorage:
         try:
             with self.path.open("rb") as stream:
                 limit = MAX_CHUNK_BYTES + MAX_RATIO * self.path.stat().st_size
-                for record in mcap_reader.read_records(stream, max_unpacked_bytes=limit):
+                for record in mcap_reader.read_records(stream, max_unpacked_bytes=limit, skip_damaged=True):
                     match record:
+                        case mcap_reader.DamagedRecord():
+                            yield BagMessage.damaged(record.at, SourceError(record.error.of(self.path)))
                         case mcap_reader.Schema():
                             schemas[record.schema_id] = record
                         case mcap_reader.Channel():
@@ -145,8 +155,9 @@ class McapStorage:
                 if of_ros in message_decoding.REFUSED:
                     yield BagMessage(channel.topic, of_ros, b"", message.log_time_ns, place)
                 return
-            place, type_name = (*place, number), TRANSLATIONS[number].type_name
-            data = translated_if_read(number, data, f"{self.path}: a message on {channel.topic}")
+            where = f"{self.path}: a message on {channel.topic}"
+            yield translated_message(number, data, where, channel.topic, message.log_time_ns, (*place, number))
+            return
         yield BagMessage(channel.topic, type_name, data, message.log_time_ns, place)
 
     @contextmanager
@@ -187,10 +198,18 @@ def translated(number: int, data: bytes, where: str) -> bytes:
         raise SourceError(f"{where} is refused: {error}") from error
 
 
-def translated_if_read(number: int, data: bytes, where: str) -> bytes:
-    """The same for a message of which something is read; any other one as it is, because its translation takes time,
-    and may fail."""
-    return translated(number, data, where) if TRANSLATIONS[number].type_name in _READ else data
+def translated_message(
+    number: int, data: bytes, where: str, topic: str, logged_ns: int, place: tuple[int, ...]
+) -> BagMessage:
+    """A message of which something is read, in CDR; any other one as it is, because its translation takes time, and may
+    fail."""
+    type_name = TRANSLATIONS[number].type_name
+    try:
+        if type_name in _READ:
+            data = translated(number, data, where)
+    except SourceError as error:
+        return BagMessage(topic, type_name, b"", logged_ns, place, error)
+    return BagMessage(topic, type_name, data, logged_ns, place)
 
 
 MAX_MESSAGE_BYTES = 256 * 2**20
@@ -310,7 +329,7 @@ MAX_HEADER_BYTES: Final = 1 << 20
 MAX_CONNECTION_BYTES: Final = 1 << 24
 """Longest data of a connection: the definition of a message has some 10 kB."""
 
-_MESSAGE, _CHUNK, _CONNECTION = 2, 5, 7
+_MESSAGE, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 5, 6, 7
 """Operations of records; others repeat what these say."""
 
 _LENGTH: Final = struct.Struct("<I")
@@ -333,6 +352,12 @@ class _Record:
         if len(value) != _LENGTH.size:
             raise ValueError(f"byte {self.at}: a record has no valid {name.decode()}")
         return int(_LENGTH.unpack(value)[0])
+
+    def offset(self, name: bytes) -> int:
+        value = self.fields.get(name, b"")
+        if len(value) != 8:
+            raise ValueError(f"byte {self.at}: a record has no valid {name.decode()}")
+        return int.from_bytes(value, "little")
 
 
 def _records(data: bytes, begin: int) -> Iterator[_Record]:
@@ -380,21 +405,40 @@ class Ros1Storage:
         connections: dict[int, tuple[str, int]] = {}
         try:
             with self.path.open("rb") as stream:
+                index = _index_of(stream)
                 left = MAX_CHUNK_BYTES + MAX_RATIO * self.path.stat().st_size
-                for record, begin in _of_file(stream):
-                    if record.operation != _CHUNK:
-                        yield from self._entry(record, _NO_CHUNK, connections)
-                        continue
-                    chunk = _unpacked(record)
-                    left -= len(chunk)
+                begin = stream.tell()
+                while True:
+                    number = bisect.bisect_right(index.chunks_at, begin)
+                    next_at = index.chunks_at[number] if number < len(index.chunks_at) else None
+                    try:
+                        record = _next(stream, next_at)
+                        if record is None:
+                            return
+                        if record.operation != _CHUNK:
+                            yield from self._entry(record, _NO_CHUNK, connections)
+                        else:
+                            chunk = _unpacked(record)
+                            left -= len(chunk)
+                            for inner in _records(chunk if left >= 0 else b"", record.at):
+                                yield from self._entry(inner, begin, connections)
+                    except ValueError as error:
+                        if next_at is None:
+                            raise
+                        stream.seek(next_at)
+                        yield BagMessage.damaged(begin, self._damage(error))
+                        for record in index.connections:
+                            yield from self._entry(record, _NO_CHUNK, connections)
                     if left < 0:
-                        raise ValueError(f"byte {record.at}: the file unpacks to more than {MAX_RATIO} times its size")
-                    for inner in _records(chunk, record.at):
-                        yield from self._entry(inner, begin, connections)
+                        raise ValueError(f"byte {begin}: the file unpacks to more than {MAX_RATIO} times its size")
+                    begin = stream.tell()
         except OSError as error:
             raise SourceError(f"cannot read {self.path}: {error.strerror}") from error
         except ValueError as error:
-            raise SourceError(f"{self.path} is damaged: {error}. `rosbag reindex` saves what is whole") from error
+            raise self._damage(error) from error
+
+    def _damage(self, error: ValueError) -> SourceError:
+        return SourceError(f"{self.path} is damaged: {error}. `rosbag reindex` saves what is whole")
 
     def _entry(self, record: _Record, chunk_at: int, connections: dict[int, tuple[str, int]]) -> Iterator[BagMessage]:
         if record.operation == _CONNECTION and len(record.data) <= MAX_CONNECTION_BYTES:
@@ -408,9 +452,9 @@ class Ros1Storage:
                 raise ValueError(f"byte {record.at}: a message has no valid time")
             seconds, nanoseconds = struct.unpack("<II", stamp)
             place = (chunk_at, record.at, len(record.data), number)
-            data = translated_if_read(number, record.data, f"{self.path}: a message on {topic}")
             logged_ns = seconds * 10**9 + nanoseconds
-            yield BagMessage(topic, TRANSLATIONS[number].type_name, data, logged_ns, place)
+            where = f"{self.path}: a message on {topic}"
+            yield translated_message(number, record.data, where, topic, logged_ns, place)
 
     @contextmanager
     def open(self) -> Iterator[BagReader]:
@@ -429,31 +473,49 @@ def _connection(record: _Record) -> tuple[str, int | None]:
     return topic, translation_of("ros1", schema)
 
 
-def _of_file(stream: BinaryIO) -> Iterator[tuple[_Record, int]]:
-    """The records of a file, each with the byte at which it begins."""
+@dataclass(frozen=True, slots=True)
+class _Index:
+    """What the end of a file repeats: where chunks begin, and where the index itself does, ascending; connections."""
+
+    chunks_at: tuple[int, ...] = ()
+    connections: tuple[_Record, ...] = ()
+
+
+def _index_of(stream: BinaryIO) -> _Index:
+    """The index of a file, which is then positioned behind its magic; empty without a sound one."""
     if stream.read(len(MAGIC)) != MAGIC:
         raise SourceError(f"{stream.name} is no bag of ROS 1 (version 2.0): byte 0: it does not begin as one does")
-    begin = stream.tell()
-    while (record := _next(stream)) is not None:
-        yield record, begin
-        begin = stream.tell()
+    chunks_at: list[int] = []
+    connections: list[_Record] = []
+    with suppress(ValueError):
+        head = _next(stream, None)
+        if head is not None and (index_at := head.offset(b"index_pos")):
+            stream.seek(index_at)
+            chunks_at.append(index_at)
+            while (record := _next(stream, None)) is not None:
+                if record.operation == _CONNECTION and len(connections) < MAX_TOPICS:
+                    connections.append(record)
+                elif record.operation == _CHUNK_INFO:
+                    chunks_at.append(record.offset(b"chunk_pos"))
+    stream.seek(len(MAGIC))
+    return _Index(tuple(sorted(chunks_at)) if len(chunks_at) > 1 else (), tuple(connections))
 
 
-def _next(stream: BinaryIO) -> _Record | None:
-    """The next record of a file; None at its end."""
+def _next(stream: BinaryIO, end_at: int | None) -> _Record | None:
+    """The next record of a file, which ends at `end_at` at the latest; None at the end of the file."""
     length = stream.read(_LENGTH.size)
     if not length:
         return None
-    header = _read(stream, length, MAX_HEADER_BYTES)
+    header = _read(stream, length, MAX_HEADER_BYTES, end_at)
     at = stream.tell() + _LENGTH.size
-    return _Record(_fields(header, at), _read(stream, stream.read(_LENGTH.size), MAX_CHUNK_BYTES), at)
+    return _Record(_fields(header, at), _read(stream, stream.read(_LENGTH.size), MAX_CHUNK_BYTES, end_at), at)
 
 
-def _read(stream: BinaryIO, length: bytes, most: int) -> bytes:
+def _read(stream: BinaryIO, length: bytes, most: int, end_at: int | None) -> bytes:
     if len(length) != _LENGTH.size:
         raise ValueError(f"byte {stream.tell()}: the file is cut off")
     (size,) = _LENGTH.unpack(length)
-    if size > most:
+    if size > most or (end_at is not None and stream.tell() + size > end_at):
         raise ValueError(f"byte {stream.tell()}: a record of {size} bytes is too long")
     data = stream.read(size)
     if len(data) != size:
@@ -507,7 +569,7 @@ class _Ros1Reader:
     def _chunk(self, chunk_at: int) -> bytes:
         self.stream.seek(chunk_at)
         try:
-            record = _next(self.stream)
+            record = _next(self.stream, None)
             return b"" if record is None else _unpacked(record)
         except ValueError as error:
             raise SourceError(f"{self.path}: the file has changed: {error}") from error
@@ -576,11 +638,15 @@ class FolderStorage:
         for number, file in enumerate(self.files):
             left = MAX_UNPACKED_MESSAGE_BYTES
             for entry in file.entries():
-                data = self.plain(entry.data)
+                error, data = entry.error, b""
+                try:
+                    data = self.plain(entry.data) if error is None else b""
+                except SourceError as refused:
+                    error = refused
                 left += MAX_RATIO * len(entry.data) - len(data)
                 if left < 0:
                     raise SourceError(f"{file.path} unpacks to more than {MAX_RATIO} times its size")
-                yield replace(entry, data=data, place=(number, *entry.place))
+                yield replace(entry, data=data, place=(number, *entry.place), error=error)
 
     @contextmanager
     def open(self) -> Iterator[BagReader]:

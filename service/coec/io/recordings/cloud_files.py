@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from coec.calibration.frames.lidar_origin import NO_SCAN_LINES, OriginCheck, from_origin, unordered
 from coec.calibration.types import LidarFrame, Matrix4, Recognition
 from coec.config import PointTimeConfig
-from coec.errors import DecodeError, SourceError
+from coec.errors import DecodeError, MisreadError, SourceError
 from coec.geometry.points import lengths
 from coec.io.frame_validation import Refusal, finite_rows
 from coec.io.recordings.cloud_formats import MAX_POINTS, TableError, columns_of_las, parse_pcd, parse_ply, viewpoint_of
@@ -96,7 +96,7 @@ def measured_from(
     a person says that they are (`has_scan_lines`). A sweep soon after one that was `checked` is as that one.
 
     Raises:
-        SourceError: the points are in millimetres, or were not measured from the origin of that frame. The message of
+        MisreadError: the points are in millimetres, or were not measured from the origin of that frame. The message of
             the latter ends with the entry of `advice` for the cause.
     """
     sweep = from_origin(cloud, T_cloud_lidar, frame_id)
@@ -104,14 +104,14 @@ def measured_from(
         return unordered(sweep) if NO_SCAN_LINES in checked.recognitions else sweep
     median_m = float(np.median(lengths(sweep.xyz_m))) if len(sweep.xyz_m) else 0.0
     if median_m > FARTHEST_MEDIAN_M:
-        raise SourceError(
+        raise MisreadError(
             f"{where}: half of the points are farther than {median_m:.0f} m: coordinates are in metres, "
             "from the LiDAR, so divide millimetres by 1000, and write points of a map in the frame of the LiDAR"
         )
     check = OriginCheck()
     contradiction = check.inspect(sweep)
     if contradiction is not None:
-        raise SourceError(f"{where}: {contradiction.sentence} {advice[contradiction.cause]}")
+        raise MisreadError(f"{where}: {contradiction.sentence} {advice[contradiction.cause]}")
     return sweep if has_scan_lines or check.has_scan_lines(sweep) else unordered(sweep)
 
 

@@ -2,18 +2,19 @@
 the grammar of a SOURCE argument, `[layout:]path[?key=value&…]`.
 """
 
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Final, Protocol, TypeVar, runtime_checkable
 from urllib.parse import parse_qsl
 
 import numpy as np
 
 from coec.calibration.types import CameraFrame, EgoMotion, Frame, LidarFrame, Matrix4, Recognition, Rig
 from coec.config import CalibrationConfig
-from coec.errors import UsageError
+from coec.errors import CoecError, DecodeError, MisreadError, SourceError, UsageError
 from coec.extensions import SOURCES, added_by_packages
 from coec.io.user_files import expand_home
 
@@ -23,6 +24,77 @@ tolerance."""
 
 _EGO, _LIDAR, _CAMERA = 0, 1, 2
 """Order of messages with equal stamps, so that the partners of a camera frame come before it."""
+
+F = TypeVar("F", bound=Frame)
+
+IMAGE, CLOUD, MOTION, RECORD = "image", "cloud", "motion", "record"
+KINDS: Final = (MOTION, CLOUD, IMAGE)
+"""What may be damaged: frames by their kind, in the order of the numbers above, and records of the container."""
+
+ALL_DAMAGED: Final = 64
+"""After so many damaged frames of a kind without a sound one, all are taken to be like the first."""
+
+
+@dataclass(slots=True)
+class DamagedFrames:
+    """What of a recording cannot be read, and is left out. Each place counts once, however often it is met."""
+
+    _causes: dict[tuple[str, object], tuple[str, str]] = field(default_factory=dict)
+
+    def add(self, kind: str, place: object, error: CoecError) -> None:
+        """Notes what `kind` at a place of the recording (a stamp, a byte) cannot be read for."""
+        refused = error if isinstance(error, DecodeError) else error.__cause__
+        cause = refused.reason if isinstance(refused, DecodeError) else f"{kind}_unreadable"
+        self._causes.setdefault((kind, place), (cause, str(error)))
+
+    def sound(self, frames: Iterable[tuple[str, int, Callable[[], F]]]) -> Iterator[F]:
+        """The frames that can be read, of (kind, stamp, function that loads it).
+
+        Raises:
+            SourceError: no frame of a kind can be read; or one was misread, so that all are.
+        """
+        read: Counter[str] = Counter()
+        refused: dict[str, list[SourceError]] = {}
+        for kind, stamp_ns, load in frames:
+            try:
+                frame = load()
+            except MisreadError:
+                raise
+            except SourceError as error:
+                self.add(kind, stamp_ns, error)
+                refused.setdefault(kind, []).append(error)
+                if not read[kind] and len(refused[kind]) == ALL_DAMAGED:
+                    break
+                continue
+            read[kind] += 1
+            yield frame
+        for kind, errors in refused.items():
+            if not read[kind] and kind != MOTION:
+                first, count = errors[0], len(errors)
+                raise first if count == 1 else SourceError(f"none of {count} {kind}s can be read; the first: {first}")
+
+    def __len__(self) -> int:
+        """How many frames and records are damaged."""
+        return len(self._causes)
+
+    @property
+    def text(self) -> str:
+        """How many frames are damaged, by cause; and the first of them, with its place."""
+        causes = Counter(cause for cause, _ in self._causes.values())
+        counts = ", ".join(f"{count} {cause}" for cause, count in sorted(causes.items()))
+        first = next(iter(self._causes.values()), ("", ""))[1]
+        return f"{len(self._causes)} damaged ({counts}); the first: {first}"
+
+    @property
+    def recognitions(self) -> tuple[Recognition, ...]:
+        """What to tell; empty if nothing is damaged."""
+        if not self._causes:
+            return ()
+        text = (
+            f"Frames or records are left out, {self.text}. If there are many, copy the recording again, or check the "
+            "disk that it was recorded on."
+        )
+        return (Recognition("damaged_frames", text, "warn"),)
 
 
 class RecordingSource(Protocol):
@@ -95,11 +167,22 @@ class HasRecognitions(Protocol):
         """What was recognised of the recording as a whole; sweeps have their own."""
         ...
 
+    @property
+    def damaged(self) -> DamagedFrames:
+        """What has been found damaged so far."""
+        ...
+
 
 def recognitions_of(recording: RecordingSource, sweeps: Iterable[LidarFrame]) -> tuple[Recognition, ...]:
     """What was recognised of a recording and of these sweeps of it, each once."""
     whole = recording.recognitions if isinstance(recording, HasRecognitions) else ()
+    whole = (*whole, *damaged_of(recording).recognitions)
     return tuple({one.code: one for one in (*whole, *(one for sweep in sweeps for one in sweep.recognitions))}.values())
+
+
+def damaged_of(recording: RecordingSource) -> DamagedFrames:
+    """What has been found damaged of a recording so far."""
+    return recording.damaged if isinstance(recording, HasRecognitions) else DamagedFrames()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,7 +202,7 @@ class FramewiseRecording:
     Attributes:
         frames: the frames, ascending by `camera_stamp_ns`.
         motions: the ego-motion, ascending by `stamp_ns`.
-        recognitions: see `HasRecognitions`.
+        recognitions, damaged: see `HasRecognitions`.
     """
 
     name: str
@@ -129,6 +212,7 @@ class FramewiseRecording:
     motions: tuple[EgoMotion, ...] = ()
     configuration: CalibrationConfig | None = None
     recognitions: tuple[Recognition, ...] = ()
+    damaged: DamagedFrames = field(default_factory=DamagedFrames)
 
     @property
     def camera_stamps_ns(self) -> tuple[int, ...]:
@@ -156,8 +240,8 @@ class FramewiseRecording:
             queue.append((frame.camera_stamp_ns, _CAMERA, place, frame.load_camera))
         for place, motion in enumerate(motions):
             queue.append((motion.stamp_ns, _EGO, place, lambda motion=motion: motion))  # type: ignore[misc]
-        for _, _, _, load in sorted(queue, key=lambda entry: entry[:3]):
-            yield load()
+        ordered = sorted(queue, key=lambda entry: entry[:3])
+        yield from self.damaged.sound((KINDS[kind], stamp_ns, load) for stamp_ns, kind, _, load in ordered)
 
 
 def selected_indices(cameras: Collection[int] | None, count: int) -> list[int]:

@@ -3,8 +3,10 @@ recording that holds more than the window.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +14,24 @@ from numpy.typing import NDArray
 
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.frames.window import NS_PER_S, BetweenPairs
-from coec.calibration.types import MOUNT_RAD, FramePair, Matrix4, Recognition, Window
+from coec.calibration.types import MOUNT_RAD, CameraFrame, Frame, FramePair, Matrix4, Recognition, Window
 from coec.config import CalibrationConfig, Config, LimitsConfig, PairingConfig, WindowConfig
-from coec.errors import SourceError, UsageError
+from coec.errors import DecodeError, SourceError, UsageError
 from coec.geometry import se3
 from coec.geometry.projection import half_field_of_view_rad
-from coec.io.images import CompressingReducer
+from coec.io.images import CompressingReducer, decode_grey_reduced
 from coec.io.mcap.windows import is_window, read_result, read_window
 from coec.io.recordings.clocks import clock_separation_text, clocks_text
 from coec.io.recordings.layouts import RecordingSource, open_source
-from coec.io.recordings.recording_source import evenly_spread, parse_spec, recognitions_of
+from coec.io.recordings.recording_source import (
+    IMAGE,
+    RECORD,
+    DamagedFrames,
+    damaged_of,
+    evenly_spread,
+    parse_spec,
+    recognitions_of,
+)
 
 WHOLE = (0.0, math.inf)
 """Begin and end of the whole recording, in seconds after the first camera frame."""
@@ -94,28 +104,53 @@ def window_of_recording(
     Raises:
         SourceError: a file cannot be read, or no camera frame has a sweep.
     """
-    within = _within(recording.camera_stamps_ns, between_s)
-    selected = [within[index] for index in evenly_spread(len(within), frames)]
-    pairer = Pairer(PairingConfig(max_stamp_jump_s=RECORDED_GAP_S), expects_motion=True)
+    left, damaged = _within(recording.camera_stamps_ns, between_s), damaged_of(recording)
+    requested = min(len(left), frames)
     pairs: list[FramePair] = []
-    for message in recording.messages(selected):
-        pairs += pairer.push(message)
-        on_progress(len(pairs), len(selected))
-    pairs += pairer.flush()
-    on_progress(len(pairs), len(selected))
+    losses: Counter[str] = Counter()
+    while len(pairs) < requested and left:
+        selected = [left[index] for index in evenly_spread(len(left), requested - len(pairs))]
+        known = len(damaged)
+        pairer = Pairer(PairingConfig(max_stamp_jump_s=RECORDED_GAP_S), expects_motion=True)
+        for message in readable(recording.messages(selected), damaged):
+            pairs += pairer.push(message)
+            on_progress(len(pairs), requested)
+        pairs += pairer.flush()
+        losses.update(pairer.losses)
+        left = sorted(set(left) - set(selected))
+        if len(damaged) == known:
+            break  # others would lack a partner, too
+    on_progress(len(pairs), requested)
+    pairs.sort(key=lambda pair: pair.stamp_ns)
+    least = min(WindowConfig().min_pairs, (requested + 1) // 2)
+    if len(pairs) < least and requested - len(pairs) <= len(damaged):
+        raise NoPairsError(f"{recording.name}: only {len(pairs)} of {requested} pairs can be read: {damaged.text}")
     if not pairs:
         raise NoPairsError(
-            f"{recording.name}: none of {len(selected)} camera frames has a sweep within "
+            f"{recording.name}: none of {requested} camera frames has a sweep within "
             f"{PairingConfig().tolerance_s} s: {clocks_text(recording.camera_stamps_ns, recording.sweep_stamps_ns)}"
         )
     window_id = f"{recording.rig.pair}-{pairs[0].stamp_ns}"
     window = Window(window_id, recording.rig, recording.T_camera_lidar_start, tuple(pairs), MOUNT_RAD)
-    losses = {cause: count for cause, count in pairer.losses.items() if count}
     recognised = recognitions_of(recording, (pair.lidar for pair in pairs))
     separate = clock_separation_text(recording.camera_stamps_ns, recording.sweep_stamps_ns)
     if separate:
         recognised = (Recognition("clocks_apart", f"Frames find the wrong sweeps: {separate}.", "fail"), *recognised)
-    return LoadedWindow(window, recording.configuration, _default_vehicle(), losses, recognised)
+    unpaired = {cause: number for cause, number in losses.items() if number}
+    return LoadedWindow(window, recording.configuration, _default_vehicle(), unpaired, recognised)
+
+
+def readable(frames: Iterable[Frame], damaged: DamagedFrames) -> Iterator[Frame]:
+    """The frames without images whose pixels cannot be decoded, which are added to `damaged`."""
+    limits = LimitsConfig(max_image_pixels=2**30)
+    for frame in frames:
+        try:
+            if isinstance(frame, CameraFrame):
+                decode_grey_reduced(frame.image, limits)
+        except DecodeError as error:
+            damaged.add(IMAGE, frame.stamp_ns, error)
+        else:
+            yield frame
 
 
 def parse_perturbation(option: str, text: str) -> NDArray[np.float64]:
@@ -167,7 +202,8 @@ def _within(stamps_ns: Sequence[int], between_s: tuple[float, float]) -> list[in
 
 
 def _recorded(path: Path, frames: int | None, between_s: tuple[float, float]) -> LoadedWindow:
-    window, configuration = read_window(path)
+    damaged = DamagedFrames()
+    window, configuration = read_window(path, partial(damaged.add, RECORD))
     within = _within([pair.stamp_ns for pair in window.pairs], between_s)
     if not within:
         raise NoPairsError(f"{path}: no pair was recorded {between_s[0]:g} to {between_s[1]:g} s after the first")
@@ -175,7 +211,8 @@ def _recorded(path: Path, frames: int | None, between_s: tuple[float, float]) ->
     if frames is not None:
         window = replace(window, pairs=tuple(window.pairs[index] for index in evenly_spread(len(window.pairs), frames)))
     result = read_result(path)
-    return LoadedWindow(window, configuration, result.vehicle if result else _default_vehicle(), {})
+    vehicle = result.vehicle if result else _default_vehicle()
+    return LoadedWindow(window, configuration, vehicle, {}, damaged.recognitions)
 
 
 def _default_vehicle() -> str:

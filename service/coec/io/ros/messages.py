@@ -118,13 +118,13 @@ def known_types() -> tuple[str, ...]:
 
 
 def is_known(type_name: str) -> bool:
-    """Whether it is one of ROS's own types; only their hashes are known."""
-    return type_name in _STORE.fielddefs and type_name not in _DEFINITIONS
+    """Whether its definition is known, and so its hash: that of ROS's own types, and of packets of LiDARs."""
+    return type_name in _STORE.fielddefs
 
 
 def has_header(type_name: str) -> bool:
     """Whether its messages are known to begin with a `std_msgs/Header`."""
-    fields = _STORE.fielddefs[type_name][1] if is_known(type_name) else []
+    fields = _STORE.fielddefs[type_name][1] if is_known(type_name) and type_name not in _DEFINITIONS else []
     return bool(fields) and fields[0][0] == "header"
 
 

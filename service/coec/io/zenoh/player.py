@@ -270,7 +270,7 @@ def dialect_of(middleware: Middleware, session: zenoh.Session, domain: int, name
 
 def is_playable(middleware: Middleware, topic: str, type_name: str) -> bool:
     """Whether a topic has a key. Topic and type must be valid ROS names, since a file may hold any text and a key with
-    `*` is none. For rmw_zenoh the type must also be one of ROS's own, as its key holds the hash of the type."""
+    `*` is none. For rmw_zenoh the definition of the type must also be known, as its key holds the hash of the type."""
     try:
         _TOPIC.validate_python(topic)
     except ValidationError:
