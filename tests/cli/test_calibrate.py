@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from cli.conftest import SMALL, Coec
-from coec.calibration.types import DepthModel
+from coec.calibration.pipeline import calibrate
+from coec.calibration.search.without_start import Weighed
+from coec.calibration.types import DepthModel, Estimate
 from coec.config import DepthConfig, LimitsConfig, VerdictConfig
 from coec.errors import OutputError, UsageError
 from coec.io import user_files
@@ -34,7 +37,17 @@ def test_recovers_the_truth_from_a_perturbed_start(coec: Coec) -> None:
     assert report["solved"] == [True, True, True, False, False, False]
 
 
-def test_without_a_start_it_says_how_many_poses_were_weighed(coec: Coec, tmp_path: Path) -> None:
+def weighed_at_once(*arguments: Any) -> tuple[Estimate, Weighed]:
+    """Stands for a search of all rotations."""
+    return calibrate(*arguments), Weighed(200_000, 40, 9, 3)
+
+
+@pytest.mark.parametrize("searches", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_without_a_start_it_says_how_many_poses_were_weighed(
+    coec: Coec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, searches: bool
+) -> None:
+    if not searches:
+        monkeypatch.setattr("coec.recording.calibrate_without_start", weighed_at_once)
     outcome = coec("calibrate", SMALL, "--depth", "stereo", "--start", "none", "--output", tmp_path / "out")
     report = json.loads((tmp_path / "out" / "result.json").read_text())
     weighed = report["weighed"]
@@ -61,14 +74,14 @@ def test_no_start_cannot_be_moved_and_takes_the_fused_objective(
 
 
 def test_failed_verdict_is_1_and_still_a_document(coec: Coec) -> None:
-    outcome = coec("calibrate", SMALL, "--depth", "stereo", "--perturb", "0,40,0", "--json")
+    outcome = coec("calibrate", SMALL, "--depth", "stereo", "--objective", "mi", "--perturb", "0,40,0", "--json")
     assert outcome.status == 1
     assert outcome.document["verdict"]["decision"] == "failed"
     assert outcome.document["verdict"]["reasons"]
 
 
 def test_text_names_axes_verdict_and_reasons(coec: Coec) -> None:
-    outcome = coec("calibrate", SMALL, "--depth", "stereo", "--perturb", "0,40,0")
+    outcome = coec("calibrate", SMALL, "--depth", "stereo", "--objective", "mi", "--perturb", "0,40,0")
     assert "ry yaw" in outcome.out
     assert "+40.000" in outcome.out
     assert "verdict failed" in outcome.out
@@ -157,7 +170,7 @@ def test_output_folder_holds_pictures_and_the_report(coec: Coec, tmp_path: Path)
 
 
 def test_fitted_double_sphere_reports_its_residual(coec: Coec, tmp_path: Path) -> None:
-    fitted = ("--camera-model", "double_sphere", "--output", tmp_path)
+    fitted = ("--objective", "mi", "--camera-model", "double_sphere", "--output", tmp_path)
     outcome = coec("calibrate", SMALL, "--depth", "stereo", *fitted, "--json")
     assert (tmp_path / "lens_residual.png").read_bytes().startswith(b"\x89PNG")
     fit = outcome.document["camera_fit"]
@@ -180,12 +193,13 @@ def test_the_lens_is_reported_on_request(coec: Coec, tmp_path: Path) -> None:
 
 
 def test_frames_bounds_the_window(coec: Coec) -> None:
-    outcome = coec("calibrate", SMALL, "--depth", "stereo", "--frames", "3", "--json")
+    outcome = coec("calibrate", SMALL, "--depth", "stereo", "--objective", "mi", "--frames", "3", "--json")
     assert outcome.document["pairs"] == 3
 
 
 def test_without_motion_compensation(coec: Coec) -> None:
-    outcome = coec("calibrate", SMALL, "--depth", "stereo", "--no-motion-compensation", "--json")
+    options = ("--depth", "stereo", "--objective", "mi", "--no-motion-compensation", "--json")
+    outcome = coec("calibrate", SMALL, *options)
     assert outcome.document["compensation"]["disabled"] == 6
 
 

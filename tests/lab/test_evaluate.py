@@ -273,15 +273,15 @@ def test_needs_a_radius(coec: Coec) -> None:
 
 def test_detection_is_the_table_of_diagnose(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("CHECKS", "FAR_CHECKS", "HALVES"):
-        monkeypatch.setattr(commissioning, name, 3)
-    monkeypatch.setattr(solve_experiments, "CHECKS", 2)
+        monkeypatch.setattr(commissioning, name, 2)
+    monkeypatch.setattr(solve_experiments, "CHECKS", 1)
     arguments = (SMALL.replace("seconds=12", "seconds=18"), "--depth", "stereo", "--detection", "1")
     report = coec("evaluate", *arguments, "--rotation-deg", "2", "--directions", "1", "--objective", "mi", "--json")
-    diagnosed = coec("diagnose", *arguments, "--checks", "2", "--json").document
+    diagnosed = coec("diagnose", *arguments, "--checks", "1", "--json").document
     detection = report.document["detection"]
     assert detection == {key: diagnosed[key] for key in ("splits", "pairs", "moves")}
     assert [row["name"] for row in detection["moves"]][:4] == ["right", "0.5 deg", "1 deg", "3 deg"]
-    assert all(row["checks"] == 2 for row in detection["moves"])
+    assert all(row["checks"] == 1 for row in detection["moves"])
 
 
 def test_displacements_are_projected_into_the_recording(coec: Coec, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -93,7 +93,10 @@ def test_hits_wrong_results_and_standard_deviations_are_counted() -> None:
     assert row_of(of, Reference(np.eye(4), 8, 8, np.zeros(6)), [lost]).failed == 1
 
 
-def test_windows_of_a_simulated_drive_are_solved_and_reported(coec: Coec, capsys: pytest.CaptureFixture[str]) -> None:
+def test_windows_of_a_simulated_drive_are_solved_and_reported(
+    coec: Coec, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(resampled_windows, "CONSENSUS_STARTS", 2)
     report = ResampleReport.model_validate(
         coec(
             "resample", SMALL, "--windows", 2, "--starts", 1, "--dof", 3, "--rotation-deg", 2, "--lens-errors",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -53,14 +54,15 @@ def test_what_does_not_fit_is_refused(coec: Coec, tmp_path: Path) -> None:
     assert (outcome.status, "street_fisheye_64_day_none_s1" in outcome.err) == (2, True)
 
 
-def test_a_drive_is_rendered_solved_and_watched(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("dofs", [(3,), pytest.param((3, 6), marks=pytest.mark.slow)])
+def test_a_drive_is_rendered_solved_and_watched(monkeypatch: pytest.MonkeyPatch, dofs: tuple[int, ...]) -> None:
     monkeypatch.setitem(matrix_drives.LENSES, "tiny", "camera=pinhole240x120")
-    settings = Settings((3, 6), 2, "stereo")
+    settings = Settings(dofs, 2, "stereo")
     drive = MatrixDrive("room-empty", "tiny", "32", "day", "none", matrix_drives.FIRST_SEED)
     result = matrix_drives.run(drive, settings)
     assert result.failure is None
-    assert [len(result.windows[key]) for key in ("3", "6")] == [2, 2]
-    for window in (*result.windows["3"], *result.windows["6"]):
+    assert {key: len(windows) for key, windows in result.windows.items()} == {str(dof): 2 for dof in dofs}
+    for window in chain.from_iterable(result.windows.values()):
         assert window.pairs == 2
         assert 2.0 <= window.start_deg <= 10.0
         assert window.failure is not None or window.evaluations > 0

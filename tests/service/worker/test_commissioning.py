@@ -15,7 +15,7 @@ from coec.calibration import commissioning
 from coec.calibration.commissioning import commission
 from coec.calibration.types import Window
 from coec.cli.convert import configuration_for
-from coec.config import CalibrationConfig, Config, DepthConfig, LimitsConfig, SearchConfig, StateConfig
+from coec.config import CalibrationConfig, Config, DepthConfig, LimitsConfig, ObjectiveConfig, SearchConfig, StateConfig
 from coec.errors import CalibrationError
 from coec.io.images import GreyImages
 from coec.io.mcap.windows import WindowWriter
@@ -25,15 +25,17 @@ from coec.service.worker.tasks import Solver
 from coec.service.worker.worker_jobs import DEADLINE_S, Commissioned, Kind, Underway, pack_pairs
 from support.simulated_drives import rendered_source
 
-CONFIG = CalibrationConfig(depth=DepthConfig(model="stereo"), search=SearchConfig(reach_deg=8.0))
+CONFIG = CalibrationConfig(
+    depth=DepthConfig(model="stereo"), objective=ObjectiveConfig(kind="mi"), search=SearchConfig(reach_deg=8.0)
+)
 
 
 @pytest.fixture(autouse=True)
 def small_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few of everything, and a slice for each step."""
-    monkeypatch.setattr(commissioning, "CHECKS", 4)
+    monkeypatch.setattr(commissioning, "CHECKS", 2)
     monkeypatch.setattr(commissioning, "FAR_CHECKS", 1)
-    monkeypatch.setattr(commissioning, "HALVES", 3)
+    monkeypatch.setattr(commissioning, "HALVES", 2)
     monkeypatch.setattr(commissioning, "SOLVES", 1)
     monkeypatch.setattr(tasks, "SLICE_S", 0.0)
 
@@ -85,7 +87,7 @@ def test_a_baseline_learned_between_checks_is_the_one_learned_without_a_pause(
             stages.append(str(reported))
     assert isinstance(reported, Commissioned)
     assert stages[:2] == ["windows 1 of 2", "windows 2 of 2"]
-    assert {"depth 8 of 8", "spread 3 of 3", "right 4 of 4", "far 1 of 1", "verdicts 2 of 2"} <= set(stages)
+    assert {"depth 8 of 8", "spread 2 of 2", "right 2 of 2", "far 1 of 1", "verdicts 2 of 2"} <= set(stages)
     windows = [replace(street, pairs=street.pairs[number::2]) for number in (0, 1)]
     depth, images = solver._network(CONFIG.depth), GreyImages(LimitsConfig())
     whole = commission(windows, depth, images, CONFIG, sensors={}, reference=street.T_camera_lidar_start)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -16,6 +17,10 @@ from warm import LENSES, pair_configs
 
 SCRIPT = """
 import gc
+import coec_lab.simulation.source
+from support.simulated_drives import rendered_drive
+
+coec_lab.simulation.source.open_sim = rendered_drive
 from numba.core.dispatcher import Dispatcher
 from coec.service.worker.warm_up import late_kernels
 from coec.service.worker.tasks import Solver
@@ -54,7 +59,8 @@ print(len(warm), sorted(used - warm), "|", sorted(kernels() - used))
 
 def test_no_calibration_waits_for_a_kernel_after_the_warm_up() -> None:
     """In a process of its own: in this one, other tests have run them all."""
-    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False)
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, env=env, check=False)
     assert done.returncode == 0, done.stderr
     warm, reported = done.stdout.split(maxsplit=1)
     assert int(warm) > 15
