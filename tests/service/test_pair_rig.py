@@ -115,13 +115,19 @@ class RigBench:
                     [frame_pair_at(stamp_ns)], self.vehicle.clock.monotonic_s(), set_clock=True
                 )
                 if self.rng.random() < 0.7:
-                    self.settle()
+                    self.turn()
+            if stamp_ns % NS_PER_S == 0:
+                self.settle()
         self.settle()
 
-    def settle(self) -> None:
+    def turn(self) -> None:
         """What the engine does until there is nothing more that it may do."""
         while self.vehicle.turn(0.0):
             pass
+
+    def settle(self) -> None:
+        """The same, and its clocks, which it looks at once a second."""
+        self.turn()
         for pair in self.pairs.values():
             pair.stream.renew_report(pair.engine.selector.statistics, self.vehicle.clock.monotonic_s())
             pair._tick()
