@@ -42,7 +42,7 @@ def test_one_check_at_a_right_and_at_a_wrong_extrinsic(coec: Coec, tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_range_edges_of_eight_small_frames_tell_that_it_moved_and_not_surely_how_far(coec: Coec) -> None:
+def test_range_edges_of_eight_small_frames_show_a_displacement_and_not_its_size(coec: Coec) -> None:
     wrong = coec("diagnose", f"{RIG}&intensity=none", *MOVED)
     assert wrong.status == 1
     assert wrong.document["flagged"]
