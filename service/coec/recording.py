@@ -4,12 +4,13 @@ A `Recording` gives `Window`s; `solve` calibrates a window, and `Result` shows a
 calls `solve` too.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import inf, isnan, nan
 from os import PathLike, fspath
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal, Unpack
 
 import numpy as np
@@ -19,7 +20,7 @@ from coec.calibration import pipeline
 from coec.calibration import types as calibration
 from coec.calibration.frames.time_offset import TimeOffset, estimate_time_offset
 from coec.calibration.search.mistake_ranking import probable_mistake
-from coec.calibration.search.mistakes import CLOCK_OFFSET
+from coec.calibration.search.mistakes import BACKWARDS, CLOCK_OFFSET, COMPENSATED, MOTION_AXES
 from coec.calibration.search.without_start import Weighed, calibrate_without_start, without_start
 from coec.calibration.solver import prepare_window_data
 from coec.calibration.uncertainty.systematic import require_fit
@@ -35,6 +36,8 @@ from coec.io.exports import formats
 from coec.io.images import GreyImages
 from coec.io.recordings import window_cutting
 from coec.io.recordings.bag import MOTION_LEFT_OUT
+from coec.io.recordings.bag_recognition import TWIST_CONTRADICTED
+from coec.io.recordings.clocks import STAMPS_IRREGULAR
 from coec.io.recordings.layouts import RecordingSource as Source
 from coec.io.recordings.recording_source import HasGroundTruth
 from coec.io.recordings.window_cutting import LoadedWindow, NoPairsError
@@ -154,7 +157,7 @@ def solve(loaded: LoadedWindow, options: CalibrationOptions, progress: calibrati
     else:
         estimate, mistake = calibrated(window, depth, images, configuration, progress)
     if estimate.verdict.decision is not calibration.Decision.ACCEPTED:
-        mistake = mistake or _left_out_motion(loaded)
+        mistake = _mistake_of_recording(loaded, mistake)
     offset = None
     if options.get("time_offset"):
         offset = estimate_time_offset(window, images, estimate.optimum.T_camera_lidar, configuration)
@@ -202,24 +205,37 @@ def calibrated(
     data = prepare_window_data(window, depth, images, configuration, progress)
     mistake = probable_mistake(data, estimate.optimum.T_camera_lidar)
     reasons = {reason.code for reason in estimate.verdict.reasons}
-    # Another focal length looks like other stamps of a vehicle that drives ahead.
-    if mistake.code == CLOCK_OFFSET if mistake is not None else calibration.INTRINSICS_OFF not in reasons:
+    # Another focal length looks like other stamps of a vehicle that drives ahead; where nothing fits, anything does.
+    doubtful = calibration.INTRINSICS_OFF in reasons or reasons >= {"edge_contrast", "runner_up"}
+    if mistake.code == CLOCK_OFFSET if mistake is not None else not doubtful:
         mistake = _measured_offset(window, images, estimate, configuration, mistake) or mistake
     progress.step("mistakes", 1, 1)
     return estimate, mistake
 
 
-def _left_out_motion(loaded: LoadedWindow) -> calibration.Mistake | None:
-    """The motion that was left out of a recording, as the probable cause of a refusal: distorted sweeps look like other
-    intrinsics, or a camera that moved."""
-    left_out = next((one for one in loaded.recognitions if one.code == MOTION_LEFT_OUT), None)
-    if left_out is None:
-        return None
-    text = f"sweeps without motion compensation are distorted, so that lens or mount seem other ones. {left_out.text}"
+OF_TIMING = (CLOCK_OFFSET, COMPENSATED, BACKWARDS, MOTION_AXES)
+"""Mistakes that irregular stamps or wrong velocities look like."""
+
+OF_RECORDING: Mapping[str, tuple[str, tuple[str, ...]]] = MappingProxyType(
+    {
+        STAMPS_IRREGULAR: ("sweeps and images of other instants do not fit each other.", OF_TIMING),
+        TWIST_CONTRADICTED: ("sweeps that are compensated for wrong motion are distorted.", OF_TIMING),
+        MOTION_LEFT_OUT: ("sweeps without motion compensation are distorted; lens or mount seem other ones.", ()),
+    }
+)
+"""What was recognised of a recording and may be why it is refused, with what follows from it, and the mistakes that it
+looks like."""
+
+
+def _mistake_of_recording(loaded: LoadedWindow, named: calibration.Mistake | None) -> calibration.Mistake | None:
+    """What was recognised of a recording as the probable cause of a refusal; else the one that was `named`."""
     rig = loaded.window.rig
-    return calibration.Mistake(
-        MOTION_LEFT_OUT, text, nan, nan, rig.camera, rig.T_camera_lidar_nominal, correctable=False
-    )
+    for code, (follows, resembled) in OF_RECORDING.items():
+        recognised = next((one for one in loaded.recognitions if one.code == code), None)
+        if recognised is not None and (named is None or named.code in resembled):
+            text = f"{follows} {recognised.text}"
+            return calibration.Mistake(code, text, nan, nan, rig.camera, rig.T_camera_lidar_nominal, correctable=False)
+    return named
 
 
 CERTAIN = 5.0

@@ -9,6 +9,7 @@ and a thread reads ahead. The engine takes the frames as they were read, and che
 
 from __future__ import annotations
 
+import os
 import queue
 import re
 import threading
@@ -63,6 +64,10 @@ are read while the engine waits for a window."""
 
 MOST_CORES = 64.0
 """Budget of a replay: what work costs does not decide what is checked."""
+
+
+MOST_THREADS = 16
+"""Threads of a worker, if the machine has so many cores: the result does not depend on their number."""
 
 
 def read_ahead(frames: Iterator[Frame], max_bytes: int) -> Iterator[Frame]:
@@ -235,7 +240,8 @@ class DriveReplay:
             update={"directory": folder, "history": MOST_ENTRIES, "checks": MOST_CHECKS, "min_free_bytes": 0}
         )
         log = config.log.model_copy(update={"level": "warning"})
-        worker = config.worker.model_copy(update={"niceness": 0})
+        threads = max(config.worker.threads, min(MOST_THREADS, len(os.sched_getaffinity(0))))
+        worker = config.worker.model_copy(update={"niceness": 0, "threads": threads})
         budget = BudgetConfig(cores=MOST_CORES)
         config = config.model_copy(update={"state": state, "budget": budget, "log": log, "worker": worker})
         self._clock = DriveClock(first_ns)

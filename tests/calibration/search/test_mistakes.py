@@ -178,11 +178,48 @@ def test_clouds_that_are_compensated_already_are_named() -> None:
 
 def test_motion_that_is_given_backwards_is_named(street: Window) -> None:
     reversed_pairs = tuple(
-        replace(pair, motion=None if pair.motion is None else pair.motion.backwards()) for pair in street.pairs
+        replace(pair, motion=None if pair.motion is None else pair.motion.in_axes(-np.eye(3))) for pair in street.pairs
     )
     mistake = named(replace(street, pairs=reversed_pairs))
     assert mistake is not None
     assert (mistake.code, mistake.correctable) == (mistakes.BACKWARDS, False)
+
+
+@pytest.mark.parametrize("has_rings", [True, False])
+def test_clouds_in_optical_axes_are_named_and_corrected(street: Window, has_rings: bool) -> None:
+    axes = mistakes.OPTICAL_FROM_BODY.astype(np.float32)
+    optical = tuple(
+        replace(
+            pair,
+            lidar=replace(pair.lidar, xyz_m=pair.lidar.xyz_m @ axes.T, ring=pair.lidar.ring if has_rings else None),
+        )
+        for pair in street.pairs
+    )
+    mistake = named(replace(street, pairs=optical))
+    assert mistake is not None
+    assert (mistake.code, mistake.correctable) == (mistakes.LIDAR_AXES, True)
+    assert mistake.text.startswith("the clouds turn about their y axis, not about z")
+    assert mistake.T_camera_lidar == pytest.approx(street.rig.T_camera_lidar_nominal @ BODY, abs=1e-9)
+
+
+def test_motion_in_other_axes_is_named(street: Window) -> None:
+    sideways = tuple(
+        replace(pair, motion=None if pair.motion is None else pair.motion.in_axes(mistakes.QUARTER_TURN))
+        for pair in street.pairs
+    )
+    mistake = named(replace(street, pairs=sideways))
+    assert mistake is not None
+    assert (mistake.code, mistake.correctable) == (mistakes.MOTION_AXES, False)
+
+
+def test_stamps_with_jitter_accuse_neither_driver_nor_motion(street: Window) -> None:
+    rng = np.random.default_rng(5)
+    jittered = tuple(
+        replace(pair, camera=replace(pair.camera, stamp_ns=pair.camera.stamp_ns + int(rng.uniform(-8e7, 8e7))))
+        for pair in street.pairs
+    )
+    mistake = named(replace(street, pairs=jittered))
+    assert mistake is None or mistake.code == mistakes.CLOCK_OFFSET
 
 
 def test_clouds_that_are_stamped_a_sweep_late_are_named(street: Window) -> None:

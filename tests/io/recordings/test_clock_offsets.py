@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from coec.calibration.types import LidarFrame
-from coec.io.recordings.clocks import clock_separation_text, clocks_text, header_clock_text
+from coec.io.recordings.clocks import clock_separation_text, clocks_text, header_clock_text, irregular_stamps_text
 from coec.io.recordings.layouts import open_source
 from coec.recording import stamped_text
 
@@ -158,3 +158,15 @@ def test_one_clock_that_is_not_the_recorders_does_no_harm() -> None:
     simulated = [1.6e9 + late_s for late_s in LAG_S]
     assert header_clock_text({"/image": simulated, "/points": simulated}, {"/image": 5.0, "/points": 5.0}) == ""
     assert header_clock_text({}, {}) == ""
+
+
+def test_irregular_stamps_are_reported_and_lost_frames_are_not() -> None:
+    rng = np.random.default_rng(2)
+    regular = 10**18 + np.arange(200) * 100_000_000
+    steady = regular + rng.integers(-5_000_000, 5_000_000, 200)
+    jittered = np.sort(regular + rng.integers(-80_000_000, 80_000_000, 200))
+    lossy = np.delete(steady, rng.choice(200, 60, replace=False))
+    assert irregular_stamps_text({"camera": steady.tolist(), "LiDAR": lossy.tolist()}) == ""
+    assert irregular_stamps_text({"camera": jittered[:15].tolist(), "LiDAR": []}) == ""
+    text = irregular_stamps_text({"camera": steady.tolist(), "LiDAR": jittered.tolist()})
+    assert re.match(r"The stamps of the LiDAR are irregular: at 1\d\.\d Hz, half of their intervals are 2\d ms", text)

@@ -40,6 +40,9 @@ RESTORED = 0.5
 """Points were compensated if undoing it leaves at most this share of the deviation from an even turn. See
 docs/measured.md."""
 
+NEARBY_M = 15.0
+"""The ground is among the points nearer than this."""
+
 AGREEING, LEAST_SWEEPS = 0.75, 3
 """Least share of the sweeps, and number of sweeps, that must show the same."""
 
@@ -59,6 +62,18 @@ def compensated_for(sweeps: Sequence[tuple[LidarFrame, EgoMotion]], T_lidar_ego:
     return instant if count >= max(LEAST_SWEEPS, AGREEING * votes.total()) else None
 
 
+def are_raw(sweeps: Sequence[tuple[LidarFrame, EgoMotion]], T_lidar_ego: Matrix4) -> bool:
+    """Whether sweeps were certainly not compensated before they were recorded: they turn evenly as they are, and no
+    longer if a compensation is undone, whatever the motion. False where that is unknown, see `compensated_for`."""
+    votes = []
+    for sweep, motion in sweeps:
+        if sweep.time_offset_s is None or not motion.reaches(LEAST_SPEED_MPS):
+            continue
+        as_given, undone = _unevenness_by_instant(sweep, motion, T_lidar_ego)
+        votes.append(as_given < RESTORED * min(undone.values()))
+    return len(votes) >= LEAST_SWEEPS and sum(votes) >= AGREEING * len(votes)
+
+
 def instants_s(sweep: LidarFrame) -> dict[str, float]:
     """The instants for which drivers compensate a sweep, seconds after its stamp, by name; none without times."""
     if sweep.time_offset_s is None:
@@ -69,6 +84,15 @@ def instants_s(sweep: LidarFrame) -> dict[str, float]:
 
 def _vote(sweep: LidarFrame, motion: EgoMotion, T_lidar_ego: Matrix4) -> str | None:
     """The instant for which the points of one sweep were compensated; None: for none."""
+    as_given, undone = _unevenness_by_instant(sweep, motion, T_lidar_ego)
+    best = min(undone, key=lambda name: undone[name])
+    return best if undone[best] < RESTORED * as_given else None
+
+
+def _unevenness_by_instant(
+    sweep: LidarFrame, motion: EgoMotion, T_lidar_ego: Matrix4
+) -> tuple[float, dict[str, float]]:
+    """The unevenness of a sweep with times, as it is, and if its compensation for each instant is undone, radians."""
     range_m = lengths(sweep.xyz_m)
     selected = np.flatnonzero((range_m > NEAR_M) & (range_m < FAR_M))
     selected = selected[:: max(1, len(selected) // POINTS)]
@@ -82,8 +106,7 @@ def _vote(sweep: LidarFrame, motion: EgoMotion, T_lidar_ego: Matrix4) -> str | N
         name: _unevenness_rad(deskew(xyz_m, instant_s - times_s, angular_radps, linear_mps), times_s, beam)
         for name, instant_s in instants_s(sweep).items()
     }
-    best = min(undone, key=lambda name: undone[name])
-    return best if undone[best] < RESTORED * as_given else None
+    return as_given, undone
 
 
 def _unevenness_rad(xyz_m: NDArray[np.float32], times_s: NDArray[np.float64], beam: NDArray[np.uint16]) -> float:
@@ -108,6 +131,10 @@ def _unevenness_rad(xyz_m: NDArray[np.float32], times_s: NDArray[np.float64], be
 SECTORS, WHOLE = 36, 0.6
 """Sectors of azimuth, and the share of them from which on a cloud counts as a whole turn."""
 
+FLAT, STEEP = 0.75, 0.95
+"""The sine of the elevations of a LiDAR about its axis of rotation stays below the first, in 99 % of its points; about
+every other axis it exceeds the second."""
+
 SAME = 1.2
 """Clouds of a LiDAR that does not turn cover at most this many times the sectors of one."""
 
@@ -123,6 +150,23 @@ def sectors(sweep: LidarFrame) -> NDArray[np.bool_]:
     azimuth = np.arctan2(sweep.xyz_m[:, 1].astype(np.float64), sweep.xyz_m[:, 0])
     sector = ((azimuth / (2.0 * np.pi) + 0.5) * SECTORS).astype(np.int64) % SECTORS
     return np.bincount(sector, minlength=SECTORS) > 0
+
+
+def upright_axes(sweeps: Sequence[LidarFrame]) -> NDArray[np.float64] | None:
+    """The rotation (3, 3) into axes with z up, of a turning LiDAR whose clouds are given in axes with another one up;
+    None for every other LiDAR, and for one that turns about z. Up is where fewer of the near points are."""
+    xyz_m = np.concatenate([sweep.xyz_m for sweep in sweeps]).astype(np.float64)
+    range_m = np.sqrt((xyz_m**2).sum(axis=1))
+    xyz_m, range_m = xyz_m[range_m > 0.0], range_m[range_m > 0.0]
+    if not len(xyz_m):
+        return None
+    sine = np.percentile(np.abs(xyz_m / range_m[:, None]), 99, axis=0)
+    axis = int(sine.argmin())
+    if axis == 2 or sine[axis] > FLAT or np.delete(sine, axis).min() < STEEP:
+        return None
+    forward = {0: 1, 1: 2}[axis]
+    x, z = np.eye(3)[forward], -np.sign(np.median(xyz_m[range_m < NEARBY_M, axis])) * np.eye(3)[axis]
+    return np.stack([x, np.cross(z, x), z]) if z.any() else None
 
 
 def clouds_in_turn(covered: Sequence[NDArray[np.bool_]]) -> int:

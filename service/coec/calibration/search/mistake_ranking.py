@@ -19,6 +19,7 @@ from math import ceil, log, log1p, log2, nan, radians
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.frames.evidence import are_raw, compensated_for, upright_axes
 from coec.calibration.objective.edges import COARSEST_BLUR_RAD
 from coec.calibration.objective.mutual_information import SearchBox
 from coec.calibration.search.global_search import sample_reach
@@ -31,13 +32,17 @@ from coec.calibration.search.mistakes import (
     FOCAL_LENGTH,
     IMAGE_SCALE,
     KINDS,
+    LIDAR_AXES,
+    MOTION_AXES,
+    OTHER_AXES,
+    QUARTER_TURN,
     TURNED_90,
     Supposition,
     changed,
     suppositions,
 )
 from coec.calibration.solver import WindowData
-from coec.calibration.types import Matrix4, Mistake, Rig
+from coec.calibration.types import FramePair, Matrix4, Mistake, Rig
 from coec.errors import CalibrationError
 from coec.geometry import se3
 from coec.geometry.cameras import pixel_rad, scaled
@@ -174,6 +179,9 @@ def probable_mistake(data: WindowData, solved: Matrix4 | None) -> Mistake | None
         return None
     if edges is None:
         return wrong_size
+    of_clouds = _other_cloud_axes(data)
+    if of_clouds is not None:
+        return of_clouds
     given, *ranked = _rank_suppositions(edges, data.window.rig, solved)
     late_s, timed = _other_time(data, edges, given)
     best, *others = ranked or [given]
@@ -198,22 +206,76 @@ def _named(best: Ranked, given: Ranked) -> Mistake:
         given.significance,
         supposition.camera,
         supposition.T_camera_lidar,
-        correctable=not supposition.mirrored and supposition.code not in (BACKWARDS, COMPENSATED, CLOCK_OFFSET),
+        correctable=not supposition.mirrored
+        and supposition.code not in (BACKWARDS, MOTION_AXES, COMPENSATED, CLOCK_OFFSET),
     )
 
 
+def _other_cloud_axes(data: WindowData) -> Mistake | None:
+    """Clouds that turn about an axis other than z, while T_camera_lidar is meant for z up. Range edges are detected
+    along turns about z, so that they are detected anew in the other axes; the motion may be given in either."""
+    part = _some_pairs(data)
+    upright = upright_axes([pair.lidar for pair in part.window.pairs])
+    if upright is None:
+        return None
+    rig, turn = part.window.rig, se3.transform_from(upright, np.zeros(3))
+    given, best = None, None
+    for T_lidar_ego in (rig.T_lidar_ego, turn @ rig.T_lidar_ego):
+        edges = _edges(_in_axes(part, upright, T_lidar_ego))
+        if edges is None:
+            return None
+        pose, about_z = rig.T_camera_lidar_nominal, se3.transform_from(QUARTER_TURN, np.zeros(3))
+        meant = [pose @ np.linalg.matrix_power(about_z, quarters) for quarters in range(4)]
+        ends = []
+        for code, T in ((AS_GIVEN, pose @ se3.inverse(turn)), *((LIDAR_AXES, T) for T in meant)):
+            supposition = Supposition(code, rig.camera, T)
+            end = _settled(edges, _local_ascent(edges, supposition, _screened(edges, supposition).starts))
+            odds = 0.0 if code == AS_GIVEN else log(KINDS[code].odds / len(meant) / AS_GIVEN_ODDS)
+            ends.append(replace(end, log_posterior=end.log_posterior + odds))
+        given = max([ends[0], *([] if given is None else [given])], key=lambda end: end.log_posterior)
+        best = max([*ends[1:], *([] if best is None else [best])], key=lambda end: end.log_posterior)
+    assert given is not None
+    assert best is not None
+    if best.log_posterior - given.log_posterior < log(LEAST_ODDS) or given.significance > GROSS * best.significance:
+        return None
+    mistake = _named(best, given)
+    return replace(
+        mistake,
+        text=f"the clouds turn about their {'xyz'[int(np.abs(upright[2]).argmax())]} axis, not about z; {mistake.text}",
+        T_camera_lidar=mistake.T_camera_lidar @ turn,
+    )
+
+
+def _in_axes(data: WindowData, rotation: NDArray[np.float64], T_lidar_ego: Matrix4) -> WindowData:
+    """The window with the points of all sweeps multiplied by a rotation (3, 3), and another pose of the vehicle."""
+
+    def turned(pair: FramePair) -> FramePair:
+        xyz_m = np.ascontiguousarray(pair.lidar.xyz_m @ rotation.T.astype(np.float32))
+        return replace(pair, lidar=replace(pair.lidar, xyz_m=xyz_m))
+
+    window = data.window
+    rig = replace(window.rig, T_lidar_ego=T_lidar_ego)
+    return replace(data, window=replace(window, rig=rig, pairs=tuple(map(turned, window.pairs))))
+
+
 def _other_time(data: WindowData, edges: Edges, given: Ranked) -> tuple[float, Ranked | None]:
-    """The clouds as they are, if a driver has compensated them for motion, or for the opposite motion, or some seconds
-    later: which fits best, and by how many seconds it is later. None if none is more probable by `LEAST_ODDS` than the
-    inputs as given and than a slightly other focal length, which looks like motion ahead; for vehicles that hardly
-    move, and where no times are known."""
+    """The clouds as they are, if a driver may have compensated them for motion, or for the opposite motion, or for
+    motion in other axes, or some seconds later: which fits best, and by how many seconds it is later. None if none is
+    more probable by `LEAST_ODDS` than the inputs as given and than a slightly other focal length, which looks like
+    motion ahead; for vehicles that hardly move, and where no times are known."""
     part = _some_pairs(data)
     sweep_s = _sweep_duration_s(part)
     moving = any(pair.motion is not None and pair.motion.reaches(LEAST_SPEED_MPS) for pair in part.window.pairs)
     if not (data.compensated and moving and sweep_s > 0.0 and len(part.window.pairs) >= LEAST_TIMED):
         return 0.0, None
-    trials = [(AS_GIVEN, 0.0, part), (COMPENSATED, 0.0, replace(part, compensated=False))]
-    trials.append((BACKWARDS, 0.0, _backwards(part)))
+    trials = [(AS_GIVEN, 0.0, part)]
+    driven = [(pair.lidar, pair.motion) for pair in part.window.pairs if pair.motion is not None]
+    T_lidar_ego = part.window.rig.T_lidar_ego
+    if not are_raw(driven, T_lidar_ego):
+        trials.append((COMPENSATED, 0.0, replace(part, compensated=False)))
+    trials.append((BACKWARDS, 0.0, _with_motion(part, -np.eye(3))))
+    if compensated_for(driven, T_lidar_ego) is None:
+        trials += [(MOTION_AXES, 0.0, _with_motion(part, rotation)) for rotation in OTHER_AXES]
     trials += [(CLOCK_OFFSET, share * sweep_s, _later(part, share * sweep_s)) for share in LATER]
     ends = []
     for code, late_s, other in trials:
@@ -224,13 +286,15 @@ def _other_time(data: WindowData, edges: Edges, given: Ranked) -> tuple[float, R
         end = _settled(moved, _local_ascent(moved, supposition, starts), given.null)
         odds = 0.0 if code == AS_GIVEN else log(KINDS[code].odds / AS_GIVEN_ODDS)
         ends.append((late_s, replace(end, log_posterior=end.log_posterior + odds)))
-    rivals, as_given, camera = [ends[0][1]], ends[0][1], given.supposition.camera
+    rivals, as_given, camera = [given, ends[0][1]], ends[0][1], given.supposition.camera
     for zoom in NEAR_ZOOMS:
         supposition = replace(given.supposition, camera=changed(camera, fx=zoom * camera.fx, fy=zoom * camera.fy))
         rival = _settled(edges, _local_ascent(edges, supposition, [as_given.T_camera_lidar]), given.null)
         odds = log(KINDS[FOCAL_LENGTH].odds / AS_GIVEN_ODDS)
         rivals.append(replace(rival, log_posterior=rival.log_posterior + odds))
     best = max(ends[1:], key=lambda end: end[1].log_posterior)
+    if best[1].supposition.code == MOTION_AXES:
+        rivals += [end for _, end in ends[1:] if end.supposition.code != MOTION_AXES]
     least = max(rival.log_posterior for rival in rivals) + log(LEAST_ODDS)
     return best if best[1].log_posterior >= least else (0.0, None)
 
@@ -243,10 +307,11 @@ def _sweep_duration_s(data: WindowData) -> float:
     return 0.0 if sweep is None else sweep.period_s
 
 
-def _backwards(data: WindowData) -> WindowData:
-    """The window with all motion reversed."""
+def _with_motion(data: WindowData, rotation: NDArray[np.float64]) -> WindowData:
+    """The window with the vectors of all motion multiplied by a matrix (3, 3)."""
     pairs = (
-        pair if pair.motion is None else replace(pair, motion=pair.motion.backwards()) for pair in data.window.pairs
+        pair if pair.motion is None else replace(pair, motion=pair.motion.in_axes(rotation))
+        for pair in data.window.pairs
     )
     return replace(data, window=replace(data.window, pairs=tuple(pairs)))
 

@@ -38,7 +38,8 @@ QUATERNION_ORDER, CAMERA_AXES, INVERSE_AND_AXES = "quaternion_order", "camera_ax
 LIDAR_AXES, POSE_UNIT, CLOUD_FRAME = "lidar_axes", "pose_unit", "cloud_frame"
 FOCAL_LENGTH, IMAGE_SCALE, PRINCIPAL_POINT = "focal_length", "image_scale", "principal_point"
 FOCAL_LENGTHS_SWAPPED, CENTRE_SWAPPED, RECTIFIED = "focal_lengths_swapped", "centre_swapped", "rectified_image"
-COMPENSATED, CLOCK_OFFSET, BACKWARDS = "already_compensated", "clock_offset", "motion_backwards"
+COMPENSATED, CLOCK_OFFSET = "already_compensated", "clock_offset"
+BACKWARDS, MOTION_AXES = "motion_backwards", "motion_axes"
 TURNED_180, TURNED_90, MIRRORED = "image_turned_180", "image_turned_90", "image_mirrored"
 
 KINDS: Mapping[str, Kind] = MappingProxyType(
@@ -133,6 +134,12 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
             "the velocities of the vehicle are probably given backwards, or in a frame that looks backwards: correct "
             "their sign, or the pose of their frame",
         ),
+        MOTION_AXES: Kind(
+            0.1,
+            "the motion in other axes",
+            "the velocities of the vehicle are probably given in a frame with other axes than the one that they name "
+            "(x forward, y left, z up): correct the frame, or turn the velocities",
+        ),
         CLOCK_OFFSET: Kind(
             0.3,
             "other stamps of the clouds",
@@ -211,6 +218,13 @@ def suppositions(rig: Rig) -> list[Supposition]:
             poses.append(replace(given, code=CLOUD_FRAME, T_camera_lidar=given.T_camera_lidar @ T_cloud_lidar))
     lenses = (replace(given, code=code, camera=camera) for code, camera in _lenses(rig.camera))
     return [given, *poses, *_of_images(given), *lenses]
+
+
+QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+"""Rotation by 90° about z."""
+
+OTHER_AXES = (QUARTER_TURN, QUARTER_TURN.T, OPTICAL_FROM_BODY, OPTICAL_FROM_BODY.T)
+"""Rotations from axes in which vectors are given to those in which they are meant."""
 
 
 def _turn(rotation: NDArray[np.float64]) -> Matrix4:

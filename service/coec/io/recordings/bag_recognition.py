@@ -54,6 +54,9 @@ FEW_CLOUDS: Final = 5
 OVERLAPPING: Final = 1.3
 """Parts of one turn last no longer than so many times their distance; clouds of two LiDARs overlap in time."""
 
+TWIST_CONTRADICTED: Final = "twist_contradicted"
+"""Code of the recognition that velocities and poses of an odometry fit in no way."""
+
 Value = TypeVar("Value")
 
 SAMPLED_SWEEPS: Final = 6
@@ -204,7 +207,7 @@ def motion_of_odometry(
             "The velocities of the odometry do not fit its poses; the velocities are used. If the poses are right, say "
             "?motion=pose; ?motion=twist leaves out this line."
         )
-        return None, Recognition("twist_contradicted", text, "warn")
+        return None, Recognition(TWIST_CONTRADICTED, text, "warn")
     text = (
         f"The velocities of the odometry are {reading}, by its poses: the motion is taken from the differences of the "
         "poses. If the velocities are right, say ?motion=twist."

@@ -38,6 +38,32 @@ def clock_separation_text(camera_stamps_ns: Sequence[int], sweep_stamps_ns: Sequ
     return _offset_text(separation_s, float(cameras[0]), float(sweeps[0]))
 
 
+STAMPS_IRREGULAR = "stamps_irregular"
+"""Code of the recognition that the stamps of a stream are irregular."""
+
+LEAST_IRREGULAR, LEAST_IRREGULAR_S, LEAST_INTERVALS = 0.15, 0.008, 20
+"""Stamps are irregular if half of their intervals are farther than both from whole multiples of the period: as a share
+of the period, and s. Fewer intervals show no period."""
+
+
+def irregular_stamps_text(stamps_ns: Mapping[str, Sequence[int]]) -> str:
+    """Which of the streams, by name, has irregular stamps, though no frame need be lost; empty if none has."""
+    for name, of_stream in stamps_ns.items():
+        intervals_s = np.diff(np.array(of_stream, dtype=np.float64)) * 1e-9
+        period_s = float(np.median(intervals_s)) if len(intervals_s) >= LEAST_INTERVALS else 0.0
+        if not 0.0 < period_s < 0.5:  # sparser frames are a selection
+            continue
+        off_s = float(np.median(np.abs(intervals_s - period_s * np.maximum(np.rint(intervals_s / period_s), 1.0))))
+        if off_s > max(LEAST_IRREGULAR * period_s, LEAST_IRREGULAR_S):
+            return (
+                f"The stamps of the {name} are irregular: at {1.0 / period_s:.1f} Hz, half of their intervals are "
+                f"{1e3 * off_s:.0f} ms or more from a whole number of periods, so that images and sweeps do not belong "
+                "to their stamps. They are probably times of receipt: let the driver stamp when it measures (hardware "
+                "time, trigger), and record again."
+            )
+    return ""
+
+
 def _offset_text(offset_s: float, camera_s: float, sweep_s: float) -> str:
     cause = offset_cause(offset_s, camera_s, sweep_s)
     # Only a difference of time scales is known exactly; streams begin up to a frame apart.

@@ -16,6 +16,7 @@ from coec.calibration.types import CameraFrame, EgoMotion, Frame, LidarFrame, Ma
 from coec.config import CalibrationConfig
 from coec.errors import CoecError, DecodeError, MisreadError, SourceError, UsageError
 from coec.extensions import SOURCES, added_by_packages
+from coec.io.recordings.clocks import STAMPS_IRREGULAR, irregular_stamps_text
 from coec.io.user_files import expand_home
 
 MOTION_REACH_NS = 1_000_000_000
@@ -176,7 +177,13 @@ class HasRecognitions(Protocol):
 def recognitions_of(recording: RecordingSource, sweeps: Iterable[LidarFrame]) -> tuple[Recognition, ...]:
     """What was recognised of a recording and of these sweeps of it, each once."""
     whole = recording.recognitions if isinstance(recording, HasRecognitions) else ()
-    whole = (*whole, *damaged_of(recording).recognitions)
+    stamps_ns = {"camera": recording.camera_stamps_ns, "LiDAR": recording.sweep_stamps_ns}
+    irregular = irregular_stamps_text(stamps_ns) if recording.configuration is None else ""
+    whole = (
+        *whole,
+        *damaged_of(recording).recognitions,
+        *((Recognition(STAMPS_IRREGULAR, irregular, "warn"),) if irregular else ()),
+    )
     return tuple({one.code: one for one in (*whole, *(one for sweep in sweeps for one in sweep.recognitions))}.values())
 
 

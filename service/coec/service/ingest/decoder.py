@@ -482,7 +482,7 @@ class Decoder:
                 return None
             self._check_times(frame)
             sender = self._sender(sample, frame) if attachment is None else attachment.gid
-            frame = self._checked(self._stamped(frame, attachment))
+            frame = self._checked(self._stamped(frame, attachment), was_read=sample.frame is not None)
             self._own.append(True)
             if sender is not None:
                 self._senders.took(sender)
@@ -534,12 +534,12 @@ class Decoder:
         self._stamped_by_sender = without
         return replace(frame, stamp_ns=attachment.source_ns) if attachment is not None and without else frame
 
-    def _checked(self, frame: Frame) -> Frame:
+    def _checked(self, frame: Frame, *, was_read: bool) -> Frame:
         stream = self._stream
         if isinstance(frame, CameraFrame) and isinstance(stream, CameraConfig):
             _check_camera(frame, stream)
         elif isinstance(frame, LidarFrame) and isinstance(stream, LidarConfig):
-            return self._from_origin(frame, stream)
+            return self._from_origin(frame, stream, was_read=was_read)
         elif isinstance(frame, EgoMotion):
             self._check_motion(frame)
         return frame
@@ -554,15 +554,15 @@ class Decoder:
             raise DecodeError("frame_id", "differs from the frame id of earlier messages")
         self._moving_frame, self._moved_otherwise = motion.frame_id, 0
 
-    def _from_origin(self, cloud: LidarFrame, lidar: LidarConfig) -> LidarFrame:
+    def _from_origin(self, cloud: LidarFrame, lidar: LidarConfig, *, was_read: bool) -> LidarFrame:
         """The sweep in the LiDAR's own frame, after checking that its ranges were measured from the origin of that
-        frame."""
+        frame. The reader of a recording has checked those that it read."""
         if cloud.frame_id != (lidar.cloud_frame_id or lidar.frame_id):
             raise DecodeError("frame_id", "differs from the frame id in the configuration")
         sweep = cloud
         if not self._is_own_frame:
             sweep = lidar_origin.from_origin(cloud, self._T_cloud_lidar, lidar.frame_id)
-        contradiction = self._contradiction(sweep)
+        contradiction = None if was_read else self._contradiction(sweep)
         if contradiction is not None:
             raise DecodeError(contradiction.cause, f"{contradiction.sentence} See lidar.{contradiction.setting}.")
         return sweep if self._ordered else lidar_origin.unordered(sweep)
