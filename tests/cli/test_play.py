@@ -264,3 +264,22 @@ def test_options_that_do_not_go_together_are_refused(coec: Coec, tmp_path: Path,
     reported = coec("play", Bag(drive_messages()).write(tmp_path / "b.mcap"), *options)
     assert reported.status == 2
     assert message in reported.err
+
+
+def test_a_drive_of_several_lidars_is_replayed_with_the_topics_of_the_configured_pair(
+    coec: Coec, tmp_path: Path
+) -> None:
+    others = [("/rear/points", message) for topic, message in drive_messages() if topic == "/points"]
+    bag = Bag([*drive_messages(), *others]).write(tmp_path / "two.mcap")
+    reported = coec("replay", bag)
+    assert (reported.status, "choose one with ?points=...: /points" in reported.err) == (1, True)
+    configuration = tmp_path / "coec.yaml"
+    configuration.write_text(
+        "middleware: rmw_zenoh\npairs:\n  - name: front\n"
+        "    camera: {topic: /front/image, type: sensor_msgs/msg/CompressedImage, frame_id: optical,\n"
+        "      intrinsics: {model: pinhole, width: 64, height: 48, fx: 40.0, fy: 40.0, cx: 31.5, cy: 23.5}}\n"
+        "    lidar: {topic: /points, frame_id: lidar}\n"
+        "    T_camera_lidar: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
+    )
+    reported = coec("replay", bag, "--config", configuration, "--from", 1000)
+    assert "no camera frame lies between --from and --until: two.mcap/front/image is shorter" in reported.err

@@ -17,7 +17,7 @@ from coec.reports.formatting import count
 
 if TYPE_CHECKING:
     from coec.calibration.types import Frame
-    from coec.config import Config
+    from coec.config import Config, PairConfig
     from coec.io.recordings.recording_source import RecordingSource
     from coec.service.decision_log import Difference, ReplayedDrive
 
@@ -157,8 +157,8 @@ def _opened(source: str, file: Path | None, name: str | None, depth: str | None)
     from coec.config import Config, load_config
     from coec.io.recordings.layouts import open_source
 
-    recording = open_source(source)
     if file is None:
+        recording = open_source(source)
         pair = configuration_for(recording, recording.T_camera_lidar_start, None)
         config = Config(pairs=(pair,))
     else:
@@ -169,11 +169,32 @@ def _opened(source: str, file: Path | None, name: str | None, depth: str | None)
             raise UsageError(f"{file} has {'no such pair' if name else 'several pairs'}: --pair is one of {known}")
         config = config.model_copy(update={"pairs": tuple(pairs)})
         (pair,) = pairs
+        try:
+            recording = open_source(source)
+        except SourceError:
+            if (of_pair := _with_topics(source, pair)) is None:
+                raise
+            recording = open_source(of_pair)
     if depth is not None:
         network = pair.calibration.depth.model_copy(update={"model": depth})
         calibration = pair.calibration.model_copy(update={"depth": network})
         config = config.model_copy(update={"pairs": (pair.model_copy(update={"calibration": calibration}),)})
     return recording, config
+
+
+def _with_topics(source: str, pair: PairConfig) -> str | None:
+    """A bag of several cameras or LiDARs, with the topics of a pair where the query names none; None for every other
+    source, and for a pair without topics."""
+    from urllib.parse import urlencode
+
+    from coec.io.recordings.recording_source import is_bag, parse_spec
+
+    spec = parse_spec(source)
+    streams = {"camera": pair.camera, "points": pair.lidar, **({"odometry": pair.ego} if pair.ego else {})}
+    topics = {key: stream.topic for key, stream in streams.items() if stream.topic and key not in spec.query}
+    if not is_bag(spec) or not topics:
+        return None
+    return f"{source}{'&' if spec.query else '?'}{urlencode(topics, safe='/')}"
 
 
 def _replay_drive(recording: RecordingSource, config: Config, begin_s: float, until_s: float | None) -> ReplayedDrive:
