@@ -22,6 +22,7 @@ from coec.config import CalibrationConfig
 from coec.errors import CoecError, SourceError
 from coec.io.mcap.windows import WindowWriter
 from coec.io.recordings import window_cutting
+from coec.io.recordings.bag import BagRecording
 from coec.io.recordings.layouts import open_source
 from coec.io.recordings.recording_source import RecordingSource, damaged_of
 from support.recordings import (
@@ -174,6 +175,20 @@ def test_damaged_headers(tmp_path: Path, topic: str) -> None:
         recording, frames = read(Bag(with_message(7, spoil, topic)).write(tmp_path / "drive.mcap"))
         assert len(frames) == 3 * FRAMES - 1
         assert reported in damaged_of(recording).text
+
+
+@pytest.mark.fault("one CameraInfo among many with a flipped bit", "it is left out, and the lens is that of the others")
+def test_a_damaged_camera_info_is_left_out(tmp_path: Path) -> None:
+    info = camera_info_message("plumb_bob", [0.0] * 5)
+    odd = replace(info, k=np.where(np.arange(9) == 0, 3.0 * info.k, info.k))
+    infos = [("/front/camera_info", odd if number == 4 else info) for number in range(12)]
+    recording = open_source(str(Bag([*infos, *DRIVE]).write(tmp_path / "drive.mcap")))
+    assert recording.rig.camera.fx == info.k[0]
+    assert isinstance(recording, BagRecording)
+    assert "camera_info_damaged" in [one.code for one in recording.recognitions]
+    few = Bag([*infos[2:6], *DRIVE]).write(tmp_path / "few.mcap")
+    with pytest.raises(SourceError, match="the CameraInfo changes on the way"):
+        open_source(str(few))
 
 
 @pytest.mark.fault("a truncated PNG and an empty cloud in a folder of images", "both are left out and reported")

@@ -85,6 +85,10 @@ SAME_PX: Final = 1.0
 """Matrices that differ by at most this are one lens, whose focus breathes."""
 
 
+RARE: Final = 5
+"""Contents that came once, a content so many times more often than all of them together, are damaged."""
+
+
 class CameraInfos:
     """The camera infos of one topic: their different contents, and how often each came."""
 
@@ -129,6 +133,11 @@ class CameraInfos:
             recognised.append(Recognition("camera_info_empty", text, "warn"))
         own = {content: count for content, count in calibrated.items() if content.frame_id in frames} or calibrated
         usual = max(own, key=own.__getitem__)
+        once = [content for content, count in own.items() if count == 1]
+        if 0 < len(once) <= own[usual] // RARE:
+            own = {content: count for content, count in own.items() if count > 1}
+            text = f"{len(once)} of {self.count} CameraInfo are unlike all others, probably damaged, and are left out."
+            recognised.append(Recognition("camera_info_damaged", text, "warn"))
         difference_px = max(np.abs(np.subtract(content.k, usual.k)).max() for content in own)
         others = [c for c in own if replace(c, k=usual.k, p=usual.p, frame_id="") != replace(usual, frame_id="")]
         if not difference_px <= SAME_PX or others:
