@@ -204,6 +204,15 @@ def test_damaged_files_of_a_folder_are_left_out(tmp_path: Path) -> None:
     assert not {3, 5} & {(pair.stamp_ns - 10**9) // PERIOD_NS for pair in loaded.window.pairs}
 
 
+@pytest.mark.fault("an image of another size than all others", "its pair is replaced by another one, and reported")
+def test_an_image_of_another_size_is_replaced(tmp_path: Path) -> None:
+    source = folder(tmp_path / "drive")
+    cv2.imwrite(str(source / "0.png"), np.zeros((48, 32), np.uint8))
+    loaded = window_cutting.load_window(str(source), 25, 25, lambda *_: None)
+    assert (len(loaded.window.pairs), loaded.window.pairs[0].stamp_ns) == (25, stamp_ns(1))
+    assert "1 image_size_mismatch" in loaded.recognitions[-1].text
+
+
 @pytest.mark.fault("an image whose pixels cannot be decoded", "its pair is replaced by another one, and reported")
 def test_a_picture_that_only_the_decoder_refuses_is_replaced(tmp_path: Path) -> None:
     source = folder(tmp_path / "drive")

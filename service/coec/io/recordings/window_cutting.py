@@ -18,7 +18,9 @@ from coec.calibration.types import MOUNT_RAD, CameraFrame, Frame, FramePair, Mat
 from coec.config import CalibrationConfig, Config, LimitsConfig, PairingConfig, WindowConfig
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.geometry import se3
+from coec.geometry.cameras import Camera
 from coec.geometry.projection import half_field_of_view_rad
+from coec.io.frame_validation import Refusal
 from coec.io.images import CompressingReducer, decode_grey_reduced
 from coec.io.mcap.windows import is_window, read_result, read_window
 from coec.io.recordings.clocks import clock_separation_text, clocks_text
@@ -115,7 +117,7 @@ def window_of_recording(
         for message in readable(recording.messages(selected), damaged):
             pairs += pairer.push(message)
             on_progress(len(pairs), requested)
-        pairs += pairer.flush()
+        pairs = _of_size(recording.rig.camera, [*pairs, *pairer.flush()], damaged)
         losses.update(pairer.losses)
         left = sorted(set(left) - set(selected))
         if len(damaged) == known:
@@ -138,6 +140,18 @@ def window_of_recording(
         recognised = (Recognition("clocks_apart", f"Frames find the wrong sweeps: {separate}.", "fail"), *recognised)
     unpaired = {cause: number for cause, number in losses.items() if number}
     return LoadedWindow(window, recording.configuration, _default_vehicle(), unpaired, recognised)
+
+
+def _of_size(camera: Camera, pairs: Sequence[FramePair], damaged: DamagedFrames) -> list[FramePair]:
+    """The pairs whose images have the size of the intrinsics, if any have; those of others are damaged."""
+    size = camera.width, camera.height
+    fitting = [pair for pair in pairs if (pair.camera.image.width, pair.camera.image.height) == size]
+    for pair in pairs if fitting else ():
+        image = pair.camera.image
+        if (image.width, image.height) != size:
+            text = f"the image at {pair.camera.stamp_ns} ns has {image.width} x {image.height} px"
+            damaged.add(IMAGE, pair.camera.stamp_ns, DecodeError(Refusal.IMAGE_SIZE_MISMATCH, text))
+    return fitting or list(pairs)
 
 
 def readable(frames: Iterable[Frame], damaged: DamagedFrames) -> Iterator[Frame]:
