@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import cast
 
 from coec.calibration.frames.window import SliceClosed
-from coec.calibration.types import Frame
+from coec.calibration.types import CameraFrame, Frame
 from coec.config import BudgetConfig, Config, PairConfig
 from coec.errors import SourceError
 from coec.io.disk_writer import DiskWriter
@@ -218,7 +218,7 @@ class _ReplayedPair(CameraLidarPair):
         if not idle or health[0] != health[1]:
             stamp_ns = self._context.vehicle.clock.wall_ns()
             self.transitions.append(Transition(stamp_ns, _event_text(event), tuple(_action_texts(actions)), health))
-        self._do(actions)
+        self._do(action for action in actions if not isinstance(action, messages.Publish))  # nobody queries a replay
 
     def end_slice(self) -> None:
         """Sensor time has come to the end of the open slice."""
@@ -266,7 +266,7 @@ class DriveReplay:
         self._pair = _ReplayedPair(config.pairs[0], config, context)
 
     def run(self, frames: Iterator[Frame], on_frame: Callable[[int], None]) -> ReplayedDrive:
-        """Has the engine take all frames. `on_frame(stamp_ns)` is called for each.
+        """Has the engine take all frames. `on_frame(stamp_ns)` is called for each image.
 
         Raises:
             SourceError: a worker cannot be used, or a frame cannot be read.
@@ -280,7 +280,8 @@ class DriveReplay:
                 if sensor is not None:
                     self._vehicle.inbox.put(sensor.number, InputSample(b"", MSGPACK, frame=frame))
                 self._settle()
-                on_frame(frame.stamp_ns)
+                if isinstance(frame, CameraFrame):
+                    on_frame(frame.stamp_ns)
             end_ns, health = self._clock.stamp_ns, self._pair.engine.store.state.health.value
             self._finish()
             elapsed_s = time.monotonic() - started_s
