@@ -19,6 +19,8 @@ from support.simulated_drives import rendered_source
 STREET = "sim:seed=5&seconds=48&camera_hz=0.17&lidar_hz=0.17&camera=pinhole640x320&lidar=32&depth=yes"
 """The drive of `tests/calibration/search/test_mistakes.py`."""
 
+FRAMES = 5
+
 
 def manifest(folder: Path, camera: Camera, rows: NDArray[np.float64]) -> Path:
     """The street as files, with intrinsics and a pose as a person wrote them."""
@@ -28,6 +30,8 @@ def manifest(folder: Path, camera: Camera, rows: NDArray[np.float64]) -> Path:
     for message in rendered_source(STREET).messages():
         if isinstance(message, LidarFrame):
             sweep = message
+        if len(frames) == FRAMES:
+            break
         if isinstance(message, CameraFrame) and sweep is not None and message.depth is not None:
             name, image = str(len(frames)), f"{len(frames)}.{message.image.format.value}"
             (folder / image).write_bytes(message.image.data)

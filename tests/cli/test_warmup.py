@@ -18,19 +18,29 @@ from coec.service.worker.compilation import compiled
 from support.rigs import pair_config
 
 
-def test_people_are_reported_where_kernels_are_and_a_program_that_none_is_compiled_again(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert warmup.warmup(lenses=["pinhole"]) == 0
-    out = capsys.readouterr().out
-    assert f"{compiled(1).total} kernels for pinhole" in out
-    assert f"cached in {compiler.kernel_cache()[0]}" in out
-    assert warmup.warmup(lenses=["pinhole"], as_json=True) == 0
-    reported = json.loads(capsys.readouterr().out)
+def test_kernels_that_are_there_are_not_compiled_again(capsys: pytest.CaptureFixture[str]) -> None:
+    def warmed() -> dict[str, Any]:
+        assert warmup.warmup(lenses=["pinhole"], as_json=True) == 0
+        document: dict[str, Any] = json.loads(capsys.readouterr().out)
+        return document
+
+    reported = warmed()
+    if reported["files_written"]:
+        reported = warmed()
     assert (reported["lenses"], reported["kernels"], reported["files_written"]) == (["pinhole"], compiled(1).total, 0)
     assert Path(reported["cache"]).is_dir()
     reached = compiled(1)
     assert reached.done == reached.total
+
+
+def test_people_are_reported_where_they_are(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(warmup, "_compile", lambda lenses: compiled(len(lenses)).total)
+    assert warmup.warmup(lenses=["pinhole"]) == 0
+    out = capsys.readouterr().out
+    assert f"{compiled(1).total} kernels for pinhole" in out
+    assert f"cached in {compiler.kernel_cache()[0]}" in out
 
 
 @pytest.fixture

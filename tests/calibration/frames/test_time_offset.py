@@ -128,8 +128,15 @@ def test_same_input_same_bits(bends: Window) -> None:
     assert estimate(bends) == estimate(bends)
 
 
-@pytest.mark.parametrize("camera", ["image_00", "image_01"])
-@pytest.mark.parametrize("offset_s", [0.0, 0.04])
+@pytest.mark.parametrize(
+    ("camera", "offset_s"),
+    [
+        ("image_00", 0.04),
+        ("image_01", 0.0),
+        pytest.param("image_00", 0.0, marks=pytest.mark.slow),
+        pytest.param("image_01", 0.04, marks=pytest.mark.slow),
+    ],
+)
 def test_an_offset_is_recovered_on_a_recording(sample_data: Path, camera: str, offset_s: float) -> None:
     window = window_of(open_source(f"kitti360:{sample_data / 'kitti360'}?camera={camera}"))
     result = estimate(late(window, offset_s))
