@@ -40,9 +40,6 @@ RESTORED = 0.5
 """Points were compensated if undoing it leaves at most this share of the deviation from an even turn. See
 docs/measured.md."""
 
-NEARBY_M = 15.0
-"""The ground is among the points nearer than this."""
-
 AGREEING, LEAST_SWEEPS = 0.75, 3
 """Least share of the sweeps, and number of sweeps, that must show the same."""
 
@@ -153,20 +150,19 @@ def sectors(sweep: LidarFrame) -> NDArray[np.bool_]:
 
 
 def upright_axes(sweeps: Sequence[LidarFrame]) -> NDArray[np.float64] | None:
-    """The rotation (3, 3) into axes with z up, of a turning LiDAR whose clouds are given in axes with another one up;
-    None for every other LiDAR, and for one that turns about z. Up is where fewer of the near points are."""
+    """The rotation (3, 3) into axes with z up or down, of a turning LiDAR whose clouds are given in axes with x or y
+    upright; None for every other LiDAR, and for one that turns about z."""
     xyz_m = np.concatenate([sweep.xyz_m for sweep in sweeps]).astype(np.float64)
     range_m = np.sqrt((xyz_m**2).sum(axis=1))
-    xyz_m, range_m = xyz_m[range_m > 0.0], range_m[range_m > 0.0]
-    if not len(xyz_m):
+    seen = range_m > 0.0
+    if not seen.any():
         return None
-    sine = np.percentile(np.abs(xyz_m / range_m[:, None]), 99, axis=0)
+    sine = np.percentile(np.abs(xyz_m[seen] / range_m[seen, None]), 99, axis=0)
     axis = int(sine.argmin())
     if axis == 2 or sine[axis] > FLAT or np.delete(sine, axis).min() < STEEP:
         return None
-    forward = {0: 1, 1: 2}[axis]
-    x, z = np.eye(3)[forward], -np.sign(np.median(xyz_m[range_m < NEARBY_M, axis])) * np.eye(3)[axis]
-    return np.stack([x, np.cross(z, x), z]) if z.any() else None
+    x, z = np.eye(3)[axis + 1], -np.eye(3)[axis]
+    return np.stack([x, np.cross(z, x), z])
 
 
 def clouds_in_turn(covered: Sequence[NDArray[np.bool_]]) -> int:

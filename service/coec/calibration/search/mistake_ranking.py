@@ -219,24 +219,25 @@ def _other_cloud_axes(data: WindowData) -> Mistake | None:
     if upright is None:
         return None
     rig, turn = part.window.rig, se3.transform_from(upright, np.zeros(3))
-    given, best = None, None
-    for T_lidar_ego in (rig.T_lidar_ego, turn @ rig.T_lidar_ego):
+    pose, about_z = rig.T_camera_lidar_nominal, se3.transform_from(QUARTER_TURN, np.zeros(3))
+    up_or_down = (np.eye(4), np.diag([1.0, -1.0, -1.0, 1.0]))
+    meant = [pose @ np.linalg.matrix_power(about_z, n) @ flip for flip in up_or_down for n in range(4)]
+    moves = any(pair.motion is not None for pair in part.window.pairs)
+    ends: list[Ranked] = []
+    for T_lidar_ego in (rig.T_lidar_ego, turn @ rig.T_lidar_ego)[: 1 + moves]:
         edges = _edges(_in_axes(part, upright, T_lidar_ego))
         if edges is None:
             return None
-        pose, about_z = rig.T_camera_lidar_nominal, se3.transform_from(QUARTER_TURN, np.zeros(3))
-        meant = [pose @ np.linalg.matrix_power(about_z, quarters) for quarters in range(4)]
-        ends = []
         for code, T in ((AS_GIVEN, pose @ se3.inverse(turn)), *((LIDAR_AXES, T) for T in meant)):
             supposition = Supposition(code, rig.camera, T)
             end = _settled(edges, _local_ascent(edges, supposition, _screened(edges, supposition).starts))
             odds = 0.0 if code == AS_GIVEN else log(KINDS[code].odds / len(meant) / AS_GIVEN_ODDS)
             ends.append(replace(end, log_posterior=end.log_posterior + odds))
-        given = max([ends[0], *([] if given is None else [given])], key=lambda end: end.log_posterior)
-        best = max([*ends[1:], *([] if best is None else [best])], key=lambda end: end.log_posterior)
-    assert given is not None
-    assert best is not None
-    if best.log_posterior - given.log_posterior < log(LEAST_ODDS) or given.significance > GROSS * best.significance:
+    ends.sort(key=lambda end: -end.log_posterior)
+    best, given = ends[0], next(end for end in ends if end.supposition.code == AS_GIVEN)
+    rivals = [given.log_posterior, *(end.log_posterior for end in ends if not _same_place(end, best))]
+    certain = best.log_posterior - float(np.logaddexp.reduce(rivals)) >= log(LEAST_ODDS)
+    if not certain or given.significance > GROSS * best.significance:
         return None
     mistake = _named(best, given)
     return replace(
