@@ -147,7 +147,7 @@ def test_what_rclpy_writes_coec_reads(rclpy: Peer, type_name: str, payload: byte
         )
 
 
-OF_ROS = {name for name in vars(messages).values() if isinstance(name, str) and messages.is_known(name)}
+OF_ROS = {name for name in vars(messages).values() if isinstance(name, str) and name in STORE.fielddefs}
 """Types beside ROS are left out: there are no wheels of their packages."""
 
 
