@@ -70,7 +70,7 @@ FIGURES: Mapping[str, DiagnosticFigure] = MappingProxyType(
             "Edges, counted once",
             "σ",
             "How significantly the LiDAR's edges lie on those of the images. What all frames have in common is counted "
-            "once; as of ten such frames. With six degrees of freedom only.",
+            "once; fewer than ten frames count as ten such. With six degrees of freedom only.",
             "the matched edges are few, or the same in all frames, as lines along a road or a standing scene are",
             "Take a window in motion, past other objects: houses, cars, posts and trees within range of the LiDAR.",
         ),

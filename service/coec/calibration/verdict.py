@@ -115,8 +115,8 @@ def change_metric(change: ChangePoint | None, limits: VerdictConfig) -> tuple[Me
 
 
 def repetition_metric(independent_samples: IndependentSamples | None, limits: VerdictConfig) -> tuple[Metric, ...]:
-    """How significant the edges of ten such frames are if all that frames have in common counts once; empty if no edges
-    were used.
+    """How significant the edges are if all that frames have in common counts once, of fewer than ten frames as if they
+    were ten such; empty if no edges were used.
 
     For a standing vehicle, what stands still in its images is the whole scene. For a driving one, what stands still are
     the lines along its road, and any two of those fit each other. See docs/measured.md.

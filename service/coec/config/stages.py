@@ -160,8 +160,8 @@ class VerdictConfig(ConfigModel):
     min_edges_once: float = Field(
         default=12.5,
         gt=0,
-        description="least edge significance where what frames have in common counts once, as of ten frames, if "
-        "translation is searched; below: a shift may fit one near board, or lines along the road (fused)",
+        description="least edge significance where what frames have in common counts once, as of ten frames if there "
+        "are fewer, if translation is searched; below: a shift may fit one near board, or lines along the road (fused)",
     )
     max_change_gain: float = Field(
         default=3.5,

@@ -403,16 +403,17 @@ class IndependentSamples:
 
     Attributes:
         count: 1 to F.
-        significance: of the edges, with what frames have in common counted once, as it would be of `REFERENCE_FRAMES`
-            such frames; standard deviations. z grows with the root of the independent part, so that it is
-            z·√(count of so many frames / F).
+        significance: of the edges, with what frames have in common counted once, and as it would be of `FEWEST_FRAMES`
+            such frames if there are fewer; standard deviations. z grows with the root of the independent part, so that
+            it is z·√(count of so many frames / F).
     """
 
     count: float
     significance: float
 
 
-REFERENCE_FRAMES = 10
+FEWEST_FRAMES = 10
+"""Frames that the significance of fewer is extrapolated to. See docs/measured.md."""
 
 
 def independent_samples_at(edges: EdgeFrames, T_camera_lidar: Matrix4) -> IndependentSamples:
@@ -422,7 +423,7 @@ def independent_samples_at(edges: EdgeFrames, T_camera_lidar: Matrix4) -> Indepe
     whole = frame_alignment(edges, T_camera_lidar).significance
     return IndependentSamples(
         effective_sample_size(alike, frames),
-        whole * math.sqrt(effective_sample_size(alike, REFERENCE_FRAMES) / frames),
+        whole * math.sqrt(effective_sample_size(alike, max(frames, FEWEST_FRAMES)) / frames),
     )
 
 
