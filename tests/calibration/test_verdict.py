@@ -33,6 +33,7 @@ from coec.calibration.verdict import (
     judge,
     on_the_sharpest,
     optimum_metrics,
+    range_metric,
     repetition_metric,
     shape_metrics,
 )
@@ -189,14 +190,22 @@ def test_what_fits_by_a_few_edges_that_all_frames_share_is_not_accepted() -> Non
     assert verdict_on(of_objective=(*OUTSTANDING, *past_trees)).decision is Decision.ACCEPTED
 
 
+def test_what_fits_by_markings_alone_is_not_accepted() -> None:
+    """A road by night, where nothing but its paint is lit."""
+    verdict = verdict_on(of_objective=(*OUTSTANDING, *range_metric(2.9, LIMITS)))
+    assert [reason.code for reason in verdict.reasons] == ["range_significance"]
+    assert verdict_on(of_objective=(*OUTSTANDING, *range_metric(8.0, LIMITS))).decision is Decision.ACCEPTED
+
+
 def test_an_objective_without_edges_has_none_to_count_once() -> None:
     assert repetition_metric(None, LIMITS) == ()
+    assert range_metric(None, LIMITS) == ()
 
 
 def assessed(samples: float = np.nan, significance: float = 20.0, rivals: tuple[float, ...] = ()) -> AssessedOptimum:
     uncertainty = replace(Uncertainty.unknown(), independent_samples=samples)
     search, posterior = SearchResult(np.eye(4), 10, TOLERANCE), posterior_of(significance=significance, nominal=1.0)
-    return AssessedOptimum(search, (), PEAK, posterior, None, rivals, uncertainty, SHARP)
+    return AssessedOptimum(search, (), PEAK, posterior, None, None, rivals, uncertainty, SHARP)
 
 
 @pytest.mark.parametrize(

@@ -74,6 +74,14 @@ FIGURES: Mapping[str, DiagnosticFigure] = MappingProxyType(
             "the matched edges are few, or the same in all frames, as lines along a road or a standing scene are",
             "Take a window in motion, past other objects: houses, cars, posts and trees within range of the LiDAR.",
         ),
+        "range_significance": DiagnosticFigure(
+            "Range edges alone",
+            "σ",
+            "How significantly the depth discontinuities of the LiDAR lie on edges of the images, without those of its "
+            "reflectance. With six degrees of freedom only.",
+            "only edges of reflectance fit, as markings on a road do at many positions of the camera",
+            "Take a window past houses, cars, posts and trees within range of the LiDAR, or by daylight.",
+        ),
         "newton_step_deg": DiagnosticFigure(
             "Slope left, rotation",
             "°",

@@ -126,6 +126,17 @@ def repetition_metric(independent_samples: IndependentSamples | None, limits: Ve
     return (Metric("edges_once", independent_samples.significance, limits.min_edges_once, at_least=True),)
 
 
+def range_metric(range_significance: float | None, limits: VerdictConfig) -> tuple[Metric, ...]:
+    """How significantly the range edges fit by themselves; empty if no edges were used.
+
+    Markings and other edges of reflectance lie on the plane of the road, on which height, pitch and the position along
+    the road trade against each other. See docs/measured.md.
+    """
+    if range_significance is None:
+        return ()
+    return (Metric("range_significance", range_significance, limits.min_range_significance, at_least=True),)
+
+
 def intrinsics_metric(distribution: posterior.Posterior | None, limits: VerdictConfig) -> tuple[Metric, ...]:
     """How certainly another lens explains the window better than that of the rig; empty if none was tried.
 
@@ -177,8 +188,9 @@ def optimum_metrics(
     """All metrics of an optimum: those of its objective, of its shape, of its edges, and of a change within the window.
     `evaluation` is that of the objective at the optimum, `scale` that of its edges, `frames` the number of pairs.
 
-    If translation is searched, what all frames have in common has to fit by itself: a shift fits one near object, or
-    lines along the road. If not, the edge contrast of one scene, as of a single frame, has to be larger.
+    If translation is searched, what all frames have in common has to fit by itself, because a shift fits one near
+    object, or lines along the road; and so have the range edges, because a shift fits markings. If not, the edge
+    contrast of one scene, as of a single frame, has to be larger.
     """
     limits = config.verdict
     counted = counted_once(of_objective, optimum.uncertainty.independent_samples, frames)
@@ -189,6 +201,7 @@ def optimum_metrics(
         *(map(_of_one_scene, of_edges) if one_scene and not repeats else of_edges),
         *shape_metrics(evaluation, optimum.curvature, optimum.sigma, limits),
         *(repetition_metric(optimum.independent, limits) if repeats else ()),
+        *(range_metric(optimum.range_significance, limits) if repeats else ()),
         *intrinsics_metric(optimum.posterior, limits),
         *change_metric(change, limits),
     )

@@ -163,6 +163,12 @@ class VerdictConfig(ConfigModel):
         description="least edge significance where what frames have in common counts once, as of ten frames if there "
         "are fewer, if translation is searched; below: a shift may fit one near board, or lines along the road (fused)",
     )
+    min_range_significance: float = Field(
+        default=5.0,
+        gt=0,
+        description="least significance of the range edges alone, standard deviations, if translation is searched; "
+        "below: a shift may fit the markings of a road (fused)",
+    )
     max_change_gain: float = Field(
         default=3.5,
         gt=0,

@@ -221,6 +221,7 @@ _GAIN: Mapping[str, float] = MappingProxyType(
         "range_edges": 1.0,
         "edge_contrast": 0.5,
         "edges_once": 0.5,
+        "range_significance": 0.5,
         "mi_over_unrelated": 0.5,
         "runner_up": -0.5,
         "sigma_deg": -1.0,

@@ -57,10 +57,13 @@ def test_each_place_of_a_drive_past_facades_is_an_observation(sharp_edges: EdgeC
     assert 0.8 * FRAMES < seen.count <= FRAMES
 
 
-def test_ten_frames_of_a_standing_vehicle_are_one_observation(sharp_edges: EdgeCue, sharp_street: Window) -> None:
+@pytest.mark.parametrize("frames", [FRAMES, 25])
+def test_frames_of_a_standing_vehicle_are_one_observation(
+    frames: int, sharp_edges: EdgeCue, sharp_street: Window
+) -> None:
     pose = sharp_street.T_camera_lidar_start
     once = independent_samples_at(selected(sharp_edges.sharp, [0]), pose)
-    standing = independent_samples_at(selected(sharp_edges.sharp, [0] * FRAMES), pose)
+    standing = independent_samples_at(selected(sharp_edges.sharp, [0] * frames), pose)
     assert once.count == 1.0
     assert standing.count == pytest.approx(1.0, abs=1e-9)
     assert standing.significance == pytest.approx(once.significance, rel=1e-4)

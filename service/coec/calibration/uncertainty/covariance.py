@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.objective import landscape as surface
-from coec.calibration.objective.edges import IndependentSamples, independent_samples_at
+from coec.calibration.objective.edges import RANGE, IndependentSamples, independent_samples_at
 from coec.calibration.objective.landscape import Curvature, Landscape, measure_curvature
 from coec.calibration.objective.mutual_information import Divisible
 from coec.calibration.search import local_search
@@ -238,6 +238,7 @@ class AssessedOptimum:
         curvature: of the objective where the search ended.
         posterior: of pose, lens and clocks; None if the estimator used no edges, or they determine no pose.
         independent: how many independent frames the window is worth; None if the estimator used no edges.
+        range_significance: of the range edges alone where the search ended; None if the estimator used no edges.
         rivals: significances of the sharpest edges next to the rivals of the pose (see `EstimatorResult`).
         uncertainty: of the pose.
         sigma: (6,) its standard deviations, rad and m; NaN on axes that were not determined.
@@ -248,6 +249,7 @@ class AssessedOptimum:
     curvature: Curvature
     posterior: Posterior | None
     independent: IndependentSamples | None
+    range_significance: float | None
     rivals: tuple[float, ...]
     uncertainty: Uncertainty
     sigma: NDArray[np.float64]
@@ -285,7 +287,7 @@ def _assessed(
     objective, edges, pose, dof = result.objective, result.edges, search.T_camera_lidar, config.search.dof
     moved = tuple(axis for axis in range(dof) if axis not in blind)
     curvature = measure_curvature(objective, pose, dof, blind)
-    posterior, independent, uncertainty = None, None, Uncertainty.unknown()
+    posterior, independent, of_range, uncertainty = None, None, None, Uncertainty.unknown()
     rivals: tuple[float, ...] = ()
     if edges is None:
         uncertainty = _scattered(objective, pose, moved, window, config.verdict.held_translation_sigma_m)
@@ -300,7 +302,9 @@ def _assessed(
         if posterior is not None and dof == TRANSLATIONS.start:
             likely = se3.perturb(pose, posterior.hypotheses[0].deviation[:6])
         independent = independent_samples_at(edges.sharp, likely)
+        of_range = float(edges.significances(edges.sharp, pose)[RANGE])
         if posterior is not None:
             uncertainty = _posterior_uncertainty(posterior, objective, pose, moved, window, independent.count)
             search = replace(search, T_camera_lidar=se3.perturb(pose, posterior.step(moved)))
-    return AssessedOptimum(search, blind, curvature, posterior, independent, rivals, uncertainty, uncertainty.sigma)
+    sigma = uncertainty.sigma
+    return AssessedOptimum(search, blind, curvature, posterior, independent, of_range, rivals, uncertainty, sigma)
