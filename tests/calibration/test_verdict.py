@@ -25,7 +25,7 @@ from coec.calibration.types import (
     Verdict,
 )
 from coec.calibration.uncertainty.covariance import AssessedOptimum
-from coec.calibration.uncertainty.posterior import Hypothesis, Posterior
+from coec.calibration.uncertainty.posterior import Hypothesis, OtherCentre, Posterior
 from coec.calibration.verdict import (
     change_metric,
     counted_once,
@@ -205,7 +205,7 @@ def test_an_objective_without_edges_has_none_to_count_once() -> None:
 def assessed(samples: float = np.nan, significance: float = 20.0, rivals: tuple[float, ...] = ()) -> AssessedOptimum:
     uncertainty = replace(Uncertainty.unknown(), independent_samples=samples)
     search, posterior = SearchResult(np.eye(4), 10, TOLERANCE), posterior_of(significance=significance, nominal=1.0)
-    return AssessedOptimum(search, (), PEAK, posterior, None, None, rivals, uncertainty, SHARP)
+    return AssessedOptimum(search, (), PEAK, posterior, None, None, rivals, None, uncertainty, SHARP)
 
 
 @pytest.mark.parametrize(
@@ -233,6 +233,13 @@ def test_the_sharpest_edges_count_with_lens_and_held_centre_at_their_most_probab
     assert on_sharp(17.0)["edge_contrast"] == 8.0
     assert on_sharp(5.0)["edge_contrast"] == 4.0
     assert on_sharp(40.0)["edge_contrast"] == OUTSTANDING[0].value
+
+
+def test_another_centre_of_the_camera_is_a_rival_though_blurred_edges_know_none() -> None:
+    optimum = replace(assessed(significance=17.0), other_centre=OtherCentre(5, 0.9))
+    blurred = (OUTSTANDING[0], replace(OUTSTANDING[1], value=0.3))
+    _, runner_up = on_the_sharpest(blurred, GOOD, Scale(mean=1.0, deviation=2.0), optimum)
+    assert (runner_up.name, runner_up.value, runner_up.passed) == ("runner_up", 0.9, False)
 
 
 def test_a_rival_that_only_blurred_edges_fit_is_none() -> None:

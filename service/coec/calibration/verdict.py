@@ -155,7 +155,7 @@ def on_the_sharpest(
 ) -> tuple[Metric, ...]:
     """The metrics of an objective, with the edge contrast of its basin on blurred edges or on the sharpest ones,
     whichever is less: between boards and walls, blurred edges also fit where no sharp one does. A rival likewise is one
-    only if it comes near on both.
+    only if it comes near on both, unless only the camera's centre is elsewhere: blurred edges are alike at both.
 
     The sharpest edges count at the optimum, where `evaluation` is that of the objective, or with lens, clocks and held
     centre at their most probable, whichever is larger. Where all is near, a held centre that is off by a centimetre
@@ -169,7 +169,11 @@ def on_the_sharpest(
     sharp = {EDGE_CONTRAST: contrast}
     if optimum.rivals and contrast > 0.0:
         sharp[RUNNER_UP] = max(0.0, *map(scale.standard, optimum.rivals)) / contrast
-    return tuple(replace(m, value=min(m.value, sharp.get(m.name, m.value))) for m in metrics)
+    elsewhere = optimum.other_centre
+    least = {} if elsewhere is None else {RUNNER_UP: elsewhere.significance}
+    return tuple(
+        replace(m, value=max(min(m.value, sharp.get(m.name, m.value)), least.get(m.name, -inf))) for m in metrics
+    )
 
 
 def _of_one_scene(metric: Metric) -> Metric:

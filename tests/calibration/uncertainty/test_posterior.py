@@ -18,6 +18,7 @@ from coec.calibration.uncertainty.posterior import (
     Posterior,
     log_odds,
     measure_posterior,
+    other_centre,
 )
 from coec.config import VerdictConfig
 from coec.geometry import se3
@@ -275,3 +276,29 @@ def test_one_frame_has_a_posterior(rng: np.random.Generator) -> None:
     sigma: Array = np.sqrt(result.hypotheses[0].covariance.diagonal()[:3])
     assert (sigma < 0.01).all()
     assert len(result.hypotheses[0].deviation[list(LENS)]) == 4
+
+
+@pytest.mark.fault("markings that repeat along the road fit at two places of the camera", "refused as ambiguous")
+@pytest.mark.parametrize(
+    ("again", "held", "ambiguous"), [(True, (), True), (False, (), False), (True, ALL_HELD, False)]
+)
+def test_edges_that_fit_again_further_along_are_seen(
+    again: bool, held: tuple[int, ...], ambiguous: bool, rng: np.random.Generator
+) -> None:
+    points = corner_points(rng)
+    seen = corner_pixels(points)
+    if again:
+        shift_m = np.array([0.0, 0.0, 0.3])
+        further = corner_pixels([some[: int(0.95 * len(some))] + shift_m for some in points])
+        seen = [np.concatenate(both) for both in zip(seen, further, strict=True)]
+    levels, window = corner_edge_levels(seen, points), corner_window(corner_motions())
+    assumed = Assumptions(levels, window, held, KNOWN_M, LENS_SIGMA)
+    result = measure_posterior(assumed, IDENTITY_POSE)
+    assert result is not None
+    elsewhere = other_centre(assumed, IDENTITY_POSE, result, VerdictConfig().max_sigma_m)
+    if ambiguous:
+        assert elsewhere is not None
+        assert elsewhere.axis == SHIFTS[2]
+        assert 0.9 < elsewhere.significance < 1.0
+    else:
+        assert elsewhere is None or elsewhere.significance < 0.5

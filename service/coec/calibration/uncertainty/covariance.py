@@ -23,7 +23,14 @@ from coec.calibration.search import local_search
 from coec.calibration.search.local_search import TRANSLATIONS, SearchResult
 from coec.calibration.solver import EstimatorResult, WindowData
 from coec.calibration.types import Matrix4, Uncertainty, Window
-from coec.calibration.uncertainty.posterior import Assumptions, Posterior, measure_posterior, significance_next_to
+from coec.calibration.uncertainty.posterior import (
+    Assumptions,
+    OtherCentre,
+    Posterior,
+    measure_posterior,
+    other_centre,
+    significance_next_to,
+)
 from coec.calibration.uncertainty.systematic import OF_SENSORS, lens_error_px, sensor_resolution, systematic_shifts
 from coec.config import CalibrationConfig
 from coec.geometry import se3
@@ -240,6 +247,7 @@ class AssessedOptimum:
         independent: how many independent frames the window is worth; None if the estimator used no edges.
         range_significance: of the range edges alone where the search ended; None if the estimator used no edges.
         rivals: significances of the sharpest edges next to the rivals of the pose (see `EstimatorResult`).
+        other_centre: another maximum of them, at another centre of the camera; None if there is none.
         uncertainty: of the pose.
         sigma: (6,) its standard deviations, rad and m; NaN on axes that were not determined.
     """
@@ -251,14 +259,21 @@ class AssessedOptimum:
     independent: IndependentSamples | None
     range_significance: float | None
     rivals: tuple[float, ...]
+    other_centre: OtherCentre | None
     uncertainty: Uncertainty
     sigma: NDArray[np.float64]
 
 
+AMBIGUOUS = 0.8
+"""Significance at another centre of the camera, over that at the result, with which the window does not determine where
+along that axis the centre is. See docs/measured.md."""
+
+
 def assess_optimum(result: EstimatorResult, data: WindowData, config: CalibrationConfig) -> AssessedOptimum:
     """What an estimator found, at the mean of its posterior, and the uncertainty of that. If the posterior has another
-    mode that is more probable, that one is assessed. If the window does not determine a translation, the search is
-    finished again with the camera's centre held there, and its new end is assessed."""
+    mode that is more probable, that one is assessed. If the window does not determine a translation, or edges fit about
+    as well elsewhere along it, the search is finished again with the camera's centre held there, and its new end is
+    assessed."""
     start, dof, limits = data.window.T_camera_lidar_start, config.search.dof, config.verdict
     held = tuple(axis for axis in TRANSLATIONS if axis >= dof)
     optimum = _assessed(result, result.search, (), held, limits.held_translation_sigma_m, data.window, config)
@@ -268,6 +283,9 @@ def assess_optimum(result: EstimatorResult, data: WindowData, config: Calibratio
         search = replace(result.search, T_camera_lidar=mode)
         optimum = _assessed(result, search, (), held, limits.held_translation_sigma_m, data.window, config)
     blind = local_search.unobservable(optimum.curvature, optimum.sigma, dof, limits)
+    elsewhere = optimum.other_centre
+    if elsewhere is not None and elsewhere.significance > AMBIGUOUS:
+        blind = tuple(sorted({*blind, elsewhere.axis}))
     if not blind:
         return optimum
     search = local_search.without(blind, optimum.search, result.objective, start, config.search, data.progress)
@@ -289,6 +307,7 @@ def _assessed(
     curvature = measure_curvature(objective, pose, dof, blind)
     posterior, independent, of_range, uncertainty = None, None, None, Uncertainty.unknown()
     rivals: tuple[float, ...] = ()
+    elsewhere = None
     if edges is None:
         uncertainty = _scattered(objective, pose, moved, window, config.verdict.held_translation_sigma_m)
     else:
@@ -304,7 +323,10 @@ def _assessed(
         independent = independent_samples_at(edges.sharp, likely)
         of_range = float(edges.significances(edges.sharp, pose)[RANGE])
         if posterior is not None:
+            elsewhere = other_centre(assumed, pose, posterior, limits.max_sigma_m)
             uncertainty = _posterior_uncertainty(posterior, objective, pose, moved, window, independent.count)
             search = replace(search, T_camera_lidar=se3.perturb(pose, posterior.step(moved)))
     sigma = uncertainty.sigma
-    return AssessedOptimum(search, blind, curvature, posterior, independent, of_range, rivals, uncertainty, sigma)
+    return AssessedOptimum(
+        search, blind, curvature, posterior, independent, of_range, rivals, elsewhere, uncertainty, sigma
+    )

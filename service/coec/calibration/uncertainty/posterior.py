@@ -225,6 +225,59 @@ def significance_next_to(assumed: Assumptions, pose: Matrix4) -> float:
         return inf
 
 
+CENTRES_M = (-0.4, -0.2, 0.2, 0.4)
+"""How far along the least certain translation other maxima are climbed. See docs/measured.md."""
+
+
+APART = 1.5
+"""How far away another maximum is elsewhere, over the largest σ of a translation that is accepted. See
+docs/measured.md."""
+
+
+@dataclass(frozen=True, slots=True)
+class OtherCentre:
+    """Another maximum of the edges, at another place of the camera's centre.
+
+    Attributes:
+        axis: of ξ, along which it lies.
+        significance: of the edges there, over that at the result.
+    """
+
+    axis: int
+    significance: float
+
+
+def other_centre(assumed: Assumptions, pose: Matrix4, posterior: Posterior, max_sigma_m: float) -> OtherCentre | None:
+    """The most significant other maximum along the translation that is least certain of those that were searched, about
+    the nominal hypothesis of the posterior at `pose` (4, 4); None if there is none.
+
+    Where markings are broken, and where the rings of the LiDAR cross them, edges lie on each other again a stride
+    further along the road.
+    """
+    searched = [place for place in SHIFTS if place not in assumed.held]
+    if not searched:
+        return None
+    nominal, prior = posterior.hypotheses[0], _priors(assumed)[NOMINAL]
+    sharp = assumed_levels(assumed.edges, assumed.window, pose)[-1:]
+    sigma = np.sqrt(nominal.covariance.diagonal())
+    along = max(searched, key=lambda place: float(sigma[place]))
+    # The pose follows, not lens and clocks: these would undo the shift.
+    noise, together = posterior.noise(range(SHIFTS.stop)), np.zeros(SIZE)
+    together[: SHIFTS.stop] = noise[:, along] / noise[along, along]
+
+    def top(start: Vector) -> Ascent:
+        return ascent(sharp, start, assumed.places, prior, posterior.independent_share)
+
+    try:
+        here = top(nominal.deviation)
+        others = [top(nominal.deviation + shift_m * together) for shift_m in CENTRES_M]
+    except ValueError:  # edges leave the view
+        return None
+    apart_m = max(APART * max_sigma_m, SAME_MODE * float(sigma[along]))
+    apart = [other.significance for other in others if abs((other.deviation - here.deviation)[along]) > apart_m]
+    return OtherCentre(along, max(apart) / max(here.significance, 1.0)) if apart else None
+
+
 def measure_posterior(assumed: Assumptions, pose: Matrix4) -> Posterior | None:
     """The posterior of a window whose search ended at `pose` (4, 4); None if its edges determine no pose."""
     levels = assumed_levels(assumed.edges, assumed.window, pose)
