@@ -229,7 +229,7 @@ CENTRES_M = (-0.4, -0.2, 0.2, 0.4)
 """How far along the least certain translation other maxima are climbed. See docs/measured.md."""
 
 
-APART = 1.5
+SEPARATION = 1.5
 """How far away another maximum is elsewhere, over the largest σ of a translation that is accepted. See
 docs/measured.md."""
 
@@ -273,9 +273,9 @@ def other_centre(assumed: Assumptions, pose: Matrix4, posterior: Posterior, max_
         others = [top(nominal.deviation + shift_m * together) for shift_m in CENTRES_M]
     except ValueError:  # edges leave the view
         return None
-    apart_m = max(APART * max_sigma_m, SAME_MODE * float(sigma[along]))
-    apart = [other.significance for other in others if abs((other.deviation - here.deviation)[along]) > apart_m]
-    return OtherCentre(along, max(apart) / max(here.significance, 1.0)) if apart else None
+    separation_m = max(SEPARATION * max_sigma_m, SAME_MODE * float(sigma[along]))
+    separate = [other.significance for other in others if abs((other.deviation - here.deviation)[along]) > separation_m]
+    return OtherCentre(along, max(separate) / max(here.significance, 1.0)) if separate else None
 
 
 def measure_posterior(assumed: Assumptions, pose: Matrix4) -> Posterior | None:
