@@ -225,7 +225,7 @@ def significance_next_to(assumed: Assumptions, pose: Matrix4) -> float:
         return inf
 
 
-CENTRES_M = (-0.4, -0.2, 0.2, 0.4)
+CENTRES_M = (-0.6, -0.4, -0.2, 0.2, 0.4, 0.6)
 """How far along the least certain translation other maxima are climbed. See docs/measured.md."""
 
 
