@@ -40,13 +40,15 @@ ALL_DAMAGED: Final = 64
 class DamagedFrames:
     """What of a recording cannot be read, and is left out. Each place counts once, however often it is met."""
 
-    _causes: dict[tuple[str, object], tuple[str, str]] = field(default_factory=dict)
+    _causes: dict[tuple[str, object], str] = field(default_factory=dict)
+    _first: str = ""
 
     def add(self, kind: str, place: object, error: CoecError) -> None:
         """Notes what `kind` at a place of the recording (a stamp, a byte) cannot be read for."""
         refused = error if isinstance(error, DecodeError) else error.__cause__
         cause = refused.reason if isinstance(refused, DecodeError) else f"{kind}_unreadable"
-        self._causes.setdefault((kind, place), (cause, str(error)))
+        self._causes.setdefault((kind, place), cause)
+        self._first = self._first or str(error)
 
     def sound(self, frames: Iterable[tuple[str, int, Callable[[], F]]]) -> Iterator[F]:
         """The frames that can be read, of (kind, stamp, function that loads it).
@@ -55,7 +57,8 @@ class DamagedFrames:
             SourceError: no frame of a kind can be read; or one was misread, so that all are.
         """
         read: Counter[str] = Counter()
-        refused: dict[str, list[SourceError]] = {}
+        refused: Counter[str] = Counter()
+        first: dict[str, SourceError] = {}
         for kind, stamp_ns, load in frames:
             try:
                 frame = load()
@@ -63,16 +66,17 @@ class DamagedFrames:
                 raise
             except SourceError as error:
                 self.add(kind, stamp_ns, error)
-                refused.setdefault(kind, []).append(error)
-                if not read[kind] and len(refused[kind]) == ALL_DAMAGED:
+                first.setdefault(kind, error)
+                refused[kind] += 1
+                if not read[kind] and refused[kind] == ALL_DAMAGED:
                     break
                 continue
             read[kind] += 1
             yield frame
-        for kind, errors in refused.items():
+        for kind, one in first.items():
             if not read[kind] and kind != MOTION:
-                first, count = errors[0], len(errors)
-                raise first if count == 1 else SourceError(f"none of {count} {kind}s can be read; the first: {first}")
+                count = refused[kind]
+                raise one if count == 1 else SourceError(f"none of {count} {kind}s can be read; the first: {one}")
 
     def __len__(self) -> int:
         """How many frames and records are damaged."""
@@ -81,10 +85,9 @@ class DamagedFrames:
     @property
     def text(self) -> str:
         """How many frames are damaged, by cause; and the first of them, with its place."""
-        causes = Counter(cause for cause, _ in self._causes.values())
+        causes = Counter(self._causes.values())
         counts = ", ".join(f"{count} {cause}" for cause, count in sorted(causes.items()))
-        first = next(iter(self._causes.values()), ("", ""))[1]
-        return f"{len(self._causes)} damaged ({counts}); the first: {first}"
+        return f"{len(self._causes)} damaged ({counts}); the first: {self._first}"
 
     @property
     def recognitions(self) -> tuple[Recognition, ...]:
