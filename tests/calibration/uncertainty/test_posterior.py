@@ -278,7 +278,10 @@ def test_one_frame_has_a_posterior(rng: np.random.Generator) -> None:
     assert len(result.hypotheses[0].deviation[list(LENS)]) == 4
 
 
-@pytest.mark.fault("markings that repeat along the road fit at two places of the camera", "refused as ambiguous")
+@pytest.mark.fault(
+    "markings that repeat along the road fit at two places of the camera",
+    "the other place is seen, and that translation is held",
+)
 @pytest.mark.parametrize(
     ("again", "held", "ambiguous"), [(True, (), True), (False, (), False), (True, ALL_HELD, False)]
 )
