@@ -32,7 +32,7 @@ from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
 from coec.io import user_files
 from coec.io.depth.depth_maps import open_depth
 from coec.io.exported_extrinsic import ExportedExtrinsic, ExportFrames, extrinsic_of_result
-from coec.io.exports import formats
+from coec.io.exports import FORMATS
 from coec.io.images import GreyImages
 from coec.io.recordings import window_cutting
 from coec.io.recordings.bag import MOTION_LEFT_OUT
@@ -342,7 +342,7 @@ def export_text(extrinsic: ExportedExtrinsic, form: str, path: Path | None) -> s
         OutputError: the present content cannot be changed.
     """
     require_format(form)
-    return formats()[form].text(extrinsic, None if path is None else _present_text(path))
+    return FORMATS[form].text(extrinsic, None if path is None else _present_text(path))
 
 
 def require_format(form: str) -> None:
@@ -351,8 +351,8 @@ def require_format(form: str) -> None:
     Raises:
         UsageError: there is no such format; the message lists those that exist.
     """
-    if form not in formats():
-        raise UsageError(f"format {form}: known are {', '.join(formats())}")
+    if form not in FORMATS:
+        raise UsageError(f"format {form}: known are {', '.join(FORMATS)}")
 
 
 def _present_text(path: Path) -> str | None:

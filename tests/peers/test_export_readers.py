@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from coec.io.exports import formats
+from coec.io.exports import FORMATS
 from peers.environments import Peer, peer
 from support.estimates import exported_extrinsic
 
@@ -23,9 +23,9 @@ def readers() -> Iterator[Peer]:
         yield readers
 
 
-@pytest.mark.parametrize("name", sorted(formats().keys() - WITHOUT_READER))
+@pytest.mark.parametrize("name", sorted(FORMATS.keys() - WITHOUT_READER))
 def test_others_read_the_same_transform(readers: Peer, name: str) -> None:
     for seed in range(20):
         reported = exported_extrinsic(np.random.default_rng(seed).uniform(-2.0, 2.0, 6))
-        read = readers.query(format=name, text=formats()[name].text(reported, None))
+        read = readers.query(format=name, text=FORMATS[name].text(reported, None))
         np.testing.assert_allclose(read["T_child_parent"], reported.T_child_parent, atol=TOLERANCE, rtol=0)

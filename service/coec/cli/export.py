@@ -10,7 +10,7 @@ import typer
 
 from coec.cli.options import Json, pair_named, suggesting
 from coec.errors import DecodeError, SourceError, UsageError
-from coec.io.exports import NAMES
+from coec.io.exports import FORMATS
 from coec.reports import console
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from coec.config import CameraIntrinsics, Config
     from coec.io.exported_extrinsic import ExportedExtrinsic, ExportFrames
 
+NAMES = tuple(FORMATS)
 
 CalibrationSource = Annotated[
     Path,

@@ -1,26 +1,14 @@
-"""What every export writes: a transform between two named frames, its uncertainty and its origin, made from a window's
-result or from a reply to `extrinsic`; conversions of rotations that formats need; and an editor that changes one
-entry of a YAML file and leaves every other byte as it is.
-
-Each format writes the direction and the order that its readers expect, and states both in the file.
-
-Of YAML the library (ruamel) only finds the place of an entry, whose lines are replaced here. Its own round trip keeps
-comments, quotes and numbers, but wraps, indents and spaces the lists of the whole document anew.
+"""What every export writes (`io.exports`): a transform between two named frames, its uncertainty and its origin, made
+from a window's result or from a reply to `extrinsic`.
 """
 
-import json
 import math
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
-from ruamel.yaml.comments import CommentedMap
-from ruamel.yaml.error import YAMLError
 
 import coec
 from coec.config import CameraIntrinsics
@@ -173,36 +161,6 @@ T_OPTICAL_BODY: Matrix = np.array(
 """Maps body coordinates (x forward, y left, z up) to optical ones (x right, y down, z forward): REP 103."""
 
 
-def quaternion_wxyz(T: Matrix) -> list[float]:
-    """Unit quaternion of a transform (4, 4), w first, w ≥ 0."""
-    x, y, z, w = se3.quaternion_xyzw_from_rotation(T[:3, :3]).tolist()
-    return [w, x, y, z]
-
-
-def quaternion_xyzw(T: Matrix) -> list[float]:
-    """Unit quaternion of a transform (4, 4), w last, w ≥ 0."""
-    return [float(value) for value in se3.quaternion_xyzw_from_rotation(T[:3, :3])]
-
-
-def roll_pitch_yaw(T: Matrix) -> list[float]:
-    """[roll, pitch, yaw] in radians, R = Rz(yaw)·Ry(pitch)·Rx(roll), as in URDF and ROS.
-
-    Yaw is taken first, then pitch and roll from the rest of the rotation. This is exact even for a pitch of a right
-    angle, where yaw and roll turn about the same axis and only their sum is determined.
-    """
-    R = T[:3, :3]
-    yaw = math.atan2(R[1, 0], R[0, 0])
-    cosine, sine = math.cos(yaw), math.sin(yaw)
-    forward = cosine * R[0] + sine * R[1]
-    left = cosine * R[1] - sine * R[0]
-    return [math.atan2(-left[2], left[1]), math.atan2(-R[2, 0], forward[0]), yaw]
-
-
-def translation_m(T: Matrix) -> list[float]:
-    """Last column of a transform (4, 4), metres."""
-    return [float(value) for value in T[:3, 3]]
-
-
 def utc(stamp_ns: int | None) -> str:
     """A stamp for people."""
     if stamp_ns is None:
@@ -347,123 +305,3 @@ def parse_pose(text: str) -> NDArray[np.float64]:
     if len(values) != 7 or not all(math.isfinite(value) for value in values):
         raise ValueError("seven finite numbers are expected: x,y,z,qx,qy,qz,qw")
     return se3.transform_from(se3.rotation_from_quaternion_xyzw(np.array(values[3:])), np.array(values[:3]))
-
-
-def number_row(values: Sequence[float]) -> str:
-    """Numbers with blanks between them, exact to the bit."""
-    return " ".join(repr(value) for value in values)
-
-
-def parsed_json(text: str) -> Any:
-    """The values of a JSON document.
-
-    Raises:
-        OutputError: the text is no JSON.
-    """
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise OutputError(f"the file is no JSON: {error}") from error
-
-
-def json_text(document: object) -> str:
-    """A JSON document as text, indented."""
-    return json.dumps(document, indent=2) + "\n"
-
-
-INDENT = "  "
-
-
-def set_yaml_entry(text: str, path: Sequence[str], lines: Sequence[str]) -> str:
-    """The text with one entry set: replaced if it exists, else added at the end of the map that should hold it.
-
-    Args:
-        text: a YAML document whose root is a map in block style.
-        path: keys from the root to the entry.
-        lines: lines of the value below the key, without indentation.
-
-    Raises:
-        OutputError: not such a document, or the entry cannot be changed without touching others.
-    """
-    before = _parsed_yaml(text)
-    parent, depth = _deepest(before, path)
-    rows = text.splitlines()
-    if depth == len(path):
-        line, column = parent.lc.key(path[-1])
-        if rows[line][:column].strip():
-            raise OutputError(f"`{path[-1]}` stands among others on line {line + 1}: it cannot be changed alone")
-        end = _end_of(rows, line, column)
-        fresh = [" " * column + f"{path[-1]}:", *(" " * column + INDENT + row for row in lines)]
-        rows[line:end] = fresh
-    else:
-        column, end = _room_in(parent, rows, path[:depth])
-        fresh = []
-        for level, key in enumerate(path[depth:]):
-            fresh.append(" " * column + INDENT * level + f"{key}:")
-        fresh += [" " * column + INDENT * len(path[depth:]) + row for row in lines]
-        rows[end:end] = fresh
-    after = "\n".join(rows) + "\n"
-    if _without(_parsed_yaml(after), path) != _without(before, path):
-        raise OutputError(f"`{path[-1]}` cannot be set without changing something else of the file")
-    return after
-
-
-def _parsed_yaml(text: str) -> CommentedMap:
-    try:
-        document = YAML().load(text)
-    except (YAMLError, ValueError, RecursionError) as error:
-        raise OutputError(f"the file is no YAML that can be changed: {str(error).splitlines()[0]}") from error
-    if not isinstance(document, CommentedMap):
-        raise OutputError("the file holds no map of names")
-    return document
-
-
-def _deepest(document: CommentedMap, path: Sequence[str]) -> tuple[CommentedMap, int]:
-    """The map that holds the longest existing part of the path, and how many keys that part has."""
-    deepest = document
-    for depth, key in enumerate(path):
-        if key not in deepest:
-            return deepest, depth
-        if depth + 1 == len(path):
-            break
-        inner = deepest[key]
-        if not isinstance(inner, CommentedMap):
-            raise OutputError(f"`{key}` is no map of names")
-        deepest = inner
-    return deepest, len(path)
-
-
-def _end_of(rows: Sequence[str], line: int, column: int) -> int:
-    """The line behind the entry that begins at a line and column."""
-    end = line + 1
-    for number in range(line + 1, len(rows)):
-        row = rows[number]
-        inside = len(row) - len(row.lstrip())
-        if row.strip() and inside <= column and not (inside == column and row.lstrip().startswith("- ")):
-            break
-        if row.strip():
-            end = number + 1
-    return end
-
-
-def _room_in(parent: CommentedMap, rows: Sequence[str], path: Sequence[str]) -> tuple[int, int]:
-    """Column of the keys of a map in block style, and the line behind its last entry."""
-    if not len(parent):
-        raise OutputError(f"`{'.'.join(path)}` is an empty map: write into another file")
-    last = list(parent)[-1]
-    line, column = parent.lc.key(last)
-    if rows[line][:column].strip():
-        raise OutputError(f"the entries beside `{last}` stand on one line: another cannot be put among them")
-    return column, _end_of(rows, line, column)
-
-
-def _without(document: Any, path: Sequence[str]) -> Any:
-    """Plain values of a document without the entry, and without maps that hold only the entry."""
-    if not isinstance(document, CommentedMap) or not path:
-        return document
-    rest = {key: value for key, value in document.items() if key != path[0]}
-    if len(path) > 1 and path[0] in document:
-        inner = _without(document[path[0]], path[1:])
-        if inner:
-            rest[path[0]] = inner
-    return rest

@@ -21,8 +21,7 @@ from ruamel.yaml import YAML
 
 from coec.config import CameraIntrinsics
 from coec.errors import OutputError
-from coec.io.exported_extrinsic import roll_pitch_yaw
-from coec.io.exports import formats
+from coec.io.exports import FORMATS, roll_pitch_yaw
 from coec.io.ros.camera_info import info_of_yaml, intrinsics_of_info
 from golden.scene import LENSES
 from support.estimates import exported_extrinsic
@@ -157,21 +156,21 @@ TURNS = strategies.lists(strategies.floats(-3.0, 3.0), min_size=6, max_size=6).m
 
 
 def test_every_format_has_a_reader_here() -> None:
-    assert READERS.keys() == formats().keys()
+    assert READERS.keys() == FORMATS.keys()
 
 
-@pytest.mark.parametrize("name", formats())
+@pytest.mark.parametrize("name", FORMATS)
 @given(xi=TURNS)
 def test_what_is_read_is_what_was_written(name: str, xi: Matrix) -> None:
     reported = exported_extrinsic(xi)
     np.testing.assert_allclose(
-        READERS[name](formats()[name].text(reported, None)), reported.T_child_parent, atol=TOLERANCE, rtol=0
+        READERS[name](FORMATS[name].text(reported, None)), reported.T_child_parent, atol=TOLERANCE, rtol=0
     )
 
 
-@pytest.mark.parametrize("name", formats())
+@pytest.mark.parametrize("name", FORMATS)
 def test_every_file_says_direction_spread_and_origin(name: str) -> None:
-    text = formats()[name].text(exported_extrinsic(np.zeros(6)), None)
+    text = FORMATS[name].text(exported_extrinsic(np.zeros(6)), None)
     assert "front-12" in text
     assert "1e-07" in text  # the first variance
     assert any(word in text for word in ("pose", "maps", "p_camera"))
@@ -179,23 +178,23 @@ def test_every_file_says_direction_spread_and_origin(name: str) -> None:
     assert '"accepted": false' not in text
 
 
-@pytest.mark.parametrize("name", formats())
+@pytest.mark.parametrize("name", FORMATS)
 def test_every_file_says_with_which_intrinsics_it_holds(name: str) -> None:
     exported = exported_extrinsic(np.zeros(6))
     assert exported.intrinsics is not None
     assert exported.intrinsics.sha256 is not None
-    text = formats()[name].text(exported, None)
+    text = FORMATS[name].text(exported, None)
     assert exported.intrinsics.sha256 in text
     assert "700.5" in text
     if name not in ("kalibr", "ros_camera_info"):
-        assert "sha256" not in formats()[name].text(exported_extrinsic(np.zeros(6), camera=None), None)
+        assert "sha256" not in FORMATS[name].text(exported_extrinsic(np.zeros(6), camera=None), None)
 
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_camera_info_is_read_back_to_the_same_lens(lens: str) -> None:
     camera = CameraIntrinsics(model=lens, width=240, height=160, **LENSES[lens])
     content = info_of_yaml(
-        YAML(typ="safe").load(formats()["ros_camera_info"].text(exported_extrinsic(np.zeros(6), (), camera), None))
+        YAML(typ="safe").load(FORMATS["ros_camera_info"].text(exported_extrinsic(np.zeros(6), (), camera), None))
     )
     assert content is not None
     read = intrinsics_of_info(content, rectified=False).intrinsics
@@ -207,12 +206,12 @@ def test_camera_info_is_read_back_to_the_same_lens(lens: str) -> None:
 
 def test_camera_info_without_intrinsics_says_where_they_come_from() -> None:
     with pytest.raises(OutputError, match=r"export from a window, or give --config"):
-        formats()["ros_camera_info"].text(exported_extrinsic(np.zeros(6), camera=None), None)
+        FORMATS["ros_camera_info"].text(exported_extrinsic(np.zeros(6), camera=None), None)
 
 
-@pytest.mark.parametrize("name", formats())
+@pytest.mark.parametrize("name", FORMATS)
 def test_what_was_forced_says_so(name: str) -> None:
-    text = formats()[name].text(exported_extrinsic(np.zeros(6), ("The edges are faint.\n-- evil: <x>",)), None)
+    text = FORMATS[name].text(exported_extrinsic(np.zeros(6), ("The edges are faint.\n-- evil: <x>",)), None)
     assert "NOT ACCEPTED" in text or '"accepted": false' in text
     assert "The edges are faint." in text
     np.testing.assert_allclose(READERS[name](text), exported_extrinsic(np.zeros(6)).T_child_parent, atol=TOLERANCE)
@@ -241,13 +240,13 @@ OTHERS = {
 @pytest.mark.parametrize("name", OTHERS)
 def test_of_a_file_with_others_the_entry_alone_is_changed(name: str) -> None:
     before, reported = OTHERS[name], exported_extrinsic(np.full(6, 0.1))
-    after = formats()[name].text(reported, before)
+    after = FORMATS[name].text(reported, before)
     np.testing.assert_allclose(READERS[name](after), reported.T_child_parent, atol=TOLERANCE)
     ours = ("cam0", "x: 9", "rostopic: /a", "rows: 1", "cols: 1", "dt: d", "data: [ 7. ]", "rows: 4", "cols: 4")
     retained = [line for line in before.splitlines() if not any(word in line for word in ours)]
     lines = iter(after.splitlines())
     assert all(line in lines for line in retained), after  # all of them, in their order
-    again = formats()[name].text(reported, after)
+    again = FORMATS[name].text(reported, after)
     assert again == after
 
 
@@ -260,42 +259,42 @@ def test_of_a_file_with_others_the_entry_alone_is_changed(name: str) -> None:
     ],
 )
 def test_of_a_document_in_json_the_rest_is_retained(name: str, before: str, retained: str) -> None:
-    once = formats()[name].text(exported_extrinsic(np.zeros(6)), before)
+    once = FORMATS[name].text(exported_extrinsic(np.zeros(6)), before)
     assert retained in once
-    assert formats()[name].text(exported_extrinsic(np.zeros(6)), once) == once
-    assert formats()[name].text(exported_extrinsic(np.full(6, 0.1)), once) != once
+    assert FORMATS[name].text(exported_extrinsic(np.zeros(6)), once) == once
+    assert FORMATS[name].text(exported_extrinsic(np.full(6, 0.1)), once) != once
 
 
 @pytest.mark.parametrize("name", ["autoware", "kalibr", "urdf", "nuscenes", "openlabel", "colmap", "opencv"])
 @pytest.mark.parametrize("existing", ["", "{", "7", "[1, 2]", "<a><b></a>", "\x00\xff"])
 def test_a_file_that_is_something_else_is_refused(name: str, existing: str) -> None:
     with pytest.raises(OutputError):
-        formats()[name].text(exported_extrinsic(np.zeros(6)), existing)
+        FORMATS[name].text(exported_extrinsic(np.zeros(6)), existing)
 
 
 def test_colmap_means_poses_from_the_reference_of_a_rig() -> None:
-    ours = formats()["colmap"].text(exported_extrinsic(np.zeros(6)), None)
+    ours = FORMATS["colmap"].text(exported_extrinsic(np.zeros(6)), None)
     rear = replace(exported_extrinsic(np.full(6, 0.2)), child="cam1")
-    (rig,) = json.loads(formats()["colmap"].text(rear, ours))  # the same parent: the same rig
+    (rig,) = json.loads(FORMATS["colmap"].text(rear, ours))  # the same parent: the same rig
     assert [camera["image_prefix"] for camera in rig["cameras"]] == ["base_link/", "cam0/", "cam1/"]
     others = json.dumps([{"cameras": [{"image_prefix": "cam0/", "ref_sensor": True}]}])
     with pytest.raises(OutputError, match="in a rig whose reference is"):
-        formats()["colmap"].text(exported_extrinsic(np.zeros(6)), others)
+        FORMATS["colmap"].text(exported_extrinsic(np.zeros(6)), others)
 
 
 def test_a_parent_that_holds_no_entries_is_refused() -> None:
     with pytest.raises(OutputError, match="`base_link` is no map of names"):
-        formats()["autoware"].text(exported_extrinsic(np.zeros(6)), "base_link: 3\n")
+        FORMATS["autoware"].text(exported_extrinsic(np.zeros(6)), "base_link: 3\n")
 
 
 def test_entries_on_one_line_are_not_torn_separate() -> None:
     with pytest.raises(OutputError, match="cannot be changed alone"):
-        formats()["autoware"].text(exported_extrinsic(np.zeros(6)), "base_link: {cam0: {x: 1}, cam1: {x: 2}}\n")
+        FORMATS["autoware"].text(exported_extrinsic(np.zeros(6)), "base_link: {cam0: {x: 1}, cam1: {x: 2}}\n")
 
 
 def test_kalibr_without_intrinsics_says_where_they_come_from() -> None:
     with pytest.raises(OutputError, match=r"export from a window, or give --config"):
-        formats()["kalibr"].text(exported_extrinsic(np.zeros(6), camera=None), None)
+        FORMATS["kalibr"].text(exported_extrinsic(np.zeros(6), camera=None), None)
 
 
 def test_the_script_starts_every_publisher_and_stays(tmp_path: Path) -> None:
@@ -303,7 +302,7 @@ def test_the_script_starts_every_publisher_and_stays(tmp_path: Path) -> None:
     stub.write_text(f'#!/bin/sh\necho "$@" >> {tmp_path}/called\n')
     stub.chmod(0o755)
     script = tmp_path / "publish.sh"
-    script.write_text(formats()["tf"].text(exported_extrinsic(np.zeros(6)), OTHERS["tf"]))
+    script.write_text(FORMATS["tf"].text(exported_extrinsic(np.zeros(6)), OTHERS["tf"]))
     path = {"PATH": f"{tmp_path}:/usr/bin:/bin"}
     subprocess.run(["/bin/sh", script], check=True, env=path, timeout=30)
     children = sorted(line.split()[-1] for line in (tmp_path / "called").read_text().splitlines())

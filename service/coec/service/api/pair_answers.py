@@ -19,7 +19,7 @@ from coec.calibration.types import Matrix4, Reason, Rig
 from coec.config import Config, OpenPairConfig, PairConfig, config_hash
 from coec.errors import CoecError, NotAcceptedError, NotFoundError
 from coec.io.exported_extrinsic import ExportFrames
-from coec.io.exports import formats
+from coec.io.exports import FORMATS
 from coec.io.ros.messages import CAMERA_INFO
 from coec.io.serialise import reasons_of, result_of
 from coec.io.zenoh.bus import Answer
@@ -140,10 +140,6 @@ class Overlays:
                     done(reason)
 
         self._worker.submit(worker_jobs.overlay(self._pair, path, T_camera_lidar, title, on_outcome, deadline_s))
-
-
-_EXPORTS = formats()
-"""Loaded with the service, so that no query has to wait for it."""
 
 
 class PairAnswers:
@@ -289,7 +285,7 @@ class PairAnswers:
         )
         if exportable.origin.rejection_reasons:
             raise NotAcceptedError(" ".join(exportable.origin.rejection_reasons))
-        written = _EXPORTS[form]
+        written = FORMATS[form]
         return Answer(written.text(exportable, None).encode(), written.encoding)
 
     def health(self, form: Format) -> Answer:

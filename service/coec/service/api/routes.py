@@ -9,7 +9,7 @@ import zenoh
 
 from coec.errors import UsageError
 from coec.io.exported_extrinsic import ExportFrames
-from coec.io.exports import NAMES
+from coec.io.exports import FORMATS
 from coec.io.zenoh.bus import Answer, Bus, QueryLane, Request, Route
 from coec.schemas import keys as bus_keys
 from coec.service.api import metrics as metrics_text
@@ -199,7 +199,7 @@ class VehicleRoutes:
 
 
 def _extrinsic(pair: AnyPairAnswers, request: Request) -> Answer:
-    selector = bus_keys.parse_extrinsic_selector(request.parameters, NAMES)
+    selector = bus_keys.parse_extrinsic_selector(request.parameters, FORMATS)
     if selector.export is None:
         return pair.calibrated.extrinsic(selector.format)
     return pair.calibrated.exported(selector.export, ExportFrames(selector.parent, selector.child))
