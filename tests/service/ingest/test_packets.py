@@ -112,7 +112,7 @@ def recorded(folder: Path, maker: Maker) -> list[LidarFrame]:
     storage = open_storage(path)
     stream = build_index(storage, CloudDecoder()).streams["/top/lidar_packets"]
     with storage.open() as reader:
-        return [one.packets.load(reader.read) for one in stream.locations if one.packets is not None]
+        return [one.packets.load(reader) for one in stream.locations if one.packets is not None]
 
 
 def sample_of(entry: Entry, number: int = 1, sender: bytes = b"a" * 16) -> InputSample:

@@ -504,7 +504,7 @@ class _Images:
         return CameraFrame(place.stamp_ns, place.frame_id, image)
 
     def _packet(self, at: tuple[int, ...]) -> bytes:
-        video = message_decoding.video_data(self._type_name, self._reader.read(at))
+        video = message_decoding.video_data(self._type_name, self._reader(at))
         return b"" if video is None else video[1]
 
 
@@ -573,7 +573,7 @@ class BagTopics:
             for place in self._places:
                 if place.topic in topics:
                     type_name = self.infos[place.topic].type_name
-                    yield TopicMessage(place.logged_ns, place.topic, type_name, reader.read(place.at))
+                    yield TopicMessage(place.logged_ns, place.topic, type_name, reader(place.at))
 
 
 def open_topics(spec: recording_source.SourceSpec) -> BagTopics:

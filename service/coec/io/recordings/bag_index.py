@@ -82,8 +82,8 @@ class CloudDecoder:
             SourceError: the file is no longer what it was.
         """
         if place.packets is not None:
-            return place.packets.load(reader.read)
-        return self.decode(place.type_name, reader.read(place.at))
+            return place.packets.load(reader)
+        return self.decode(place.type_name, reader(place.at))
 
 
 VIDEO_TYPES = (messages.FFMPEG_PACKET, messages.COMPRESSED_VIDEO)
@@ -326,7 +326,7 @@ class BagIndex:
         for topic in self.transforms_at:
             for place in self.transforms_at[topic][:MAX_TF_MESSAGES]:
                 try:
-                    joints = ros_transforms.decode_static_transforms(reader.read(place)).joints
+                    joints = ros_transforms.decode_static_transforms(reader(place)).joints
                 except DecodeError:
                     continue
                 for joint in joints:
@@ -550,4 +550,4 @@ def _joints(index: BagIndex, reader: BagReader, topic: str) -> set[tuple[str, st
 
 
 def _messages(index: BagIndex, reader: BagReader, topic: str) -> Iterable[bytes]:
-    return (reader.read(place) for place in index.transforms_at[topic])
+    return (reader(place) for place in index.transforms_at[topic])

@@ -237,7 +237,7 @@ def _near_each_other(places: Sequence[MessageLocation]) -> list[int]:
 
 def _posed(reader: BagReader, place: MessageLocation) -> evidence.PoseAndTwist | None:
     """Pose and velocity of a message; None if it is damaged, which is told when it is used."""
-    payload = reader.read(place.at)
+    payload = reader(place.at)
     try:
         return evidence.PoseAndTwist(odometry_pose(payload), message_decoding.odometry(payload))
     except DecodeError:

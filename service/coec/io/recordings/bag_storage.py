@@ -20,7 +20,7 @@ import struct
 import tempfile
 import weakref
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -66,16 +66,9 @@ class BagMessage:
         return cls("", "", b"", 0, (at,), error)
 
 
-class BagReader(Protocol):
-    """Reads messages again while the files are open."""
-
-    def read(self, place: tuple[int, ...]) -> bytes:
-        """The data of the message at a place.
-
-        Raises:
-            SourceError: the file is no longer what it was.
-        """
-        ...
+BagReader = Callable[[tuple[int, ...]], bytes]
+"""Reads the data of the message at a place again, while the files are open. Raises SourceError if the file is no longer
+what it was."""
 
 
 class BagStorage(Protocol):
@@ -164,22 +157,17 @@ class McapStorage:
     def open(self) -> Iterator[BagReader]:
         """See `BagStorage`."""
         with self.path.open("rb") as stream:
-            yield _McapReader(self.path, mcap_reader.MessageReader(stream))
+            reader = mcap_reader.MessageReader(stream)
 
+            def read(place: tuple[int, ...]) -> bytes:
+                chunk_at, at, length, *number = place
+                try:
+                    data = reader.read(None if chunk_at == _NO_CHUNK else chunk_at, at, length)
+                except mcap_reader.McapDamagedError as error:
+                    raise SourceError(f"{self.path}: {error}") from error
+                return translated(number[0], data, f"{self.path}: a message") if number else data
 
-@dataclass(frozen=True, slots=True)
-class _McapReader:
-    path: Path
-    reader: mcap_reader.MessageReader
-
-    def read(self, place: tuple[int, ...]) -> bytes:
-        """See `BagReader`."""
-        chunk_at, at, length, *number = place
-        try:
-            data = self.reader.read(None if chunk_at == _NO_CHUNK else chunk_at, at, length)
-        except mcap_reader.McapDamagedError as error:
-            raise SourceError(f"{self.path}: {error}") from error
-        return translated(number[0], data, f"{self.path}: a message") if number else data
+            yield read
 
 
 _READ = frozenset((*message_decoding.KNOWN, *messages.OTHER_TYPES, messages.CAMERA_INFO, messages.TF))
@@ -260,7 +248,7 @@ class SqliteStorage:
     def open(self) -> Iterator[BagReader]:
         """See `BagStorage`."""
         with self._connected() as connection:
-            yield _SqliteReader(self, connection)
+            yield lambda place: self._read(connection, place[0])
 
     def _topics(self, connection: sqlite3.Connection) -> dict[int, tuple[str, str, str]]:
         """Name, type and serialization of each topic, by id."""
@@ -274,7 +262,7 @@ class SqliteStorage:
             raise SourceError(f"{self.path} has more than {MAX_TOPICS} topics")
         return topics
 
-    def read_from(self, connection: sqlite3.Connection, row: int) -> bytes:
+    def _read(self, connection: sqlite3.Connection, row: int) -> bytes:
         """The data of the message in a row."""
         row_data = connection.execute("SELECT data FROM messages WHERE rowid = ?", (row,)).fetchone()
         if row_data is None:
@@ -307,16 +295,6 @@ class SqliteStorage:
             if getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_NOTADB:
                 raise SourceError(f"{self.path} is no bag: it is no database of SQLite") from error
             raise SourceError(f"{self.path} is damaged: {error}. `ros2 bag reindex` may save it") from error
-
-
-@dataclass(frozen=True, slots=True)
-class _SqliteReader:
-    storage: SqliteStorage
-    connection: sqlite3.Connection
-
-    def read(self, place: tuple[int, ...]) -> bytes:
-        """See `BagReader`."""
-        return self.storage.read_from(self.connection, place[0])
 
 
 # --- bags of ROS 1 ----------------------------------------------------------------------------------------------------
@@ -460,7 +438,7 @@ class Ros1Storage:
     def open(self) -> Iterator[BagReader]:
         """See `BagStorage`."""
         with self.path.open("rb") as stream:
-            yield _Ros1Reader(self.path, stream)
+            yield _Ros1Reader(self.path, stream).read
 
 
 def _connection(record: _Record) -> tuple[str, int | None]:
@@ -652,7 +630,7 @@ class FolderStorage:
     def open(self) -> Iterator[BagReader]:
         """See `BagStorage`."""
         with ExitStack() as opened:
-            yield _FolderReader(self, opened, {})
+            yield _FolderReader(self, opened, {}).read
 
     def plain(self, data: bytes) -> bytes:
         """A message as it was before it was packed."""
@@ -685,7 +663,7 @@ class _FolderReader:
             self.opened.close()
             self.current.clear()
             self.current[number] = self.opened.enter_context(self.folder.files[number].open())
-        return self.folder.plain(self.current[number].read(tuple(rest)))
+        return self.folder.plain(self.current[number](tuple(rest)))
 
 
 def open_folder(path: Path) -> FolderStorage:

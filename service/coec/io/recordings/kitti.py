@@ -298,25 +298,30 @@ def _stamps(path: Path, last: int) -> list[int]:
 
 def _calibration(folder: Path, number: str, width: int, height: int) -> tuple[Matrix4, cameras.Camera]:
     cam_path, velo_path = folder / "calib_cam_to_cam.txt", folder / "calib_velo_to_cam.txt"
-    cam, velo = read_numbers(cam_path), read_numbers(velo_path)
+    cam = read_numbers(cam_path)
     P = numbers_of(cam_path, cam, f"P_rect_{number}", 12).reshape(3, 4)
     baseline = np.eye(4)
     baseline[:3, 3] = np.linalg.solve(P[:, :3], P[:, 3])
-    T_cam0_velo = homogeneous(numbers_of(velo_path, velo, "R", 9))
-    T_cam0_velo[:3, 3] = numbers_of(velo_path, velo, "T", 3)
-    T_camera_lidar = rigid(baseline @ homogeneous(numbers_of(cam_path, cam, "R_rect_00", 9)) @ T_cam0_velo)
-    model = cameras.build("pinhole", width=width, height=height, fx=P[0, 0], fy=P[1, 1], cx=P[0, 2], cy=P[1, 2])
-    return T_camera_lidar, model
+    R_rect = homogeneous(numbers_of(cam_path, cam, "R_rect_00", 9))
+    return rigid(baseline @ R_rect @ _rotation_and_translation(velo_path)), _pinhole(P, width, height)
+
+
+def _pinhole(P: NDArray[np.float64], width: int, height: int) -> cameras.Camera:
+    """The camera of a projection matrix (3, 4)."""
+    return cameras.build("pinhole", width=width, height=height, fx=P[0, 0], fy=P[1, 1], cx=P[0, 2], cy=P[1, 2])
+
+
+def _rotation_and_translation(path: Path) -> NDArray[np.float64]:
+    """(4, 4) from the entries R and T of a file."""
+    numbers = read_numbers(path)
+    T = homogeneous(numbers_of(path, numbers, "R", 9))
+    T[:3, 3] = numbers_of(path, numbers, "T", 3)
+    return T
 
 
 def _imu_to_velo(path: Path) -> Matrix4:
     """T_lidar_ego; the identity if the file is absent (the sensors are less than a metre apart)."""
-    if not path.is_file():
-        return np.eye(4)
-    numbers = read_numbers(path)
-    T = homogeneous(numbers_of(path, numbers, "R", 9))
-    T[:3, 3] = numbers_of(path, numbers, "T", 3)
-    return rigid(T)
+    return rigid(_rotation_and_translation(path)) if path.is_file() else np.eye(4)
 
 
 def _motions(folder: Path, camera_stamps_ns: list[int]) -> tuple[EgoMotion, ...]:
@@ -395,9 +400,7 @@ def open_kitti_odometry(spec: SourceSpec) -> FramewiseRecording:
     T_camera_lidar = rigid(T_camera_cam0 @ T_cam0_velo)
     rig = Rig(
         pair=camera,
-        camera=cameras.build(
-            "pinhole", width=image.width, height=image.height, fx=P[0, 0], fy=P[1, 1], cx=P[0, 2], cy=P[1, 2]
-        ),
+        camera=_pinhole(P, image.width, image.height),
         camera_frame=camera,
         lidar_frame=LIDAR_FRAME,
         T_camera_lidar_nominal=T_camera_lidar,
@@ -533,8 +536,7 @@ def _rectification(calibration: Path, number: str) -> Matrix4:
 
 def _perspective(calibration: Path, number: str, width: int, height: int) -> cameras.Camera:
     path = calibration / "perspective.txt"
-    P = numbers_of(path, read_numbers(path), f"P_rect_{number}", 12).reshape(3, 4)
-    return cameras.build("pinhole", width=width, height=height, fx=P[0, 0], fy=P[1, 1], cx=P[0, 2], cy=P[1, 2])
+    return _pinhole(numbers_of(path, read_numbers(path), f"P_rect_{number}", 12).reshape(3, 4), width, height)
 
 
 def _fisheye(path: Path) -> cameras.Camera:
