@@ -23,7 +23,7 @@ from coec.geometry.points import thinned
 from coec.geometry.projection import points_in_view
 from coec.io.frame_validation import Refusal
 from coec.io.images import BYTES_PER_PIXEL, NEAREST_M, WHOLE_SCALE, decode_bgr, encode_jpeg
-from coec.io.ros.message_encoding import UnsupportedCameraError, ros_camera
+from coec.io.ros.message_encoding import DISTORTION, UnsupportedCameraError, ros_camera
 
 NOT_SERVED = "not_served"
 """State: no service serves the pair, as its liveliness token is absent."""
@@ -134,16 +134,6 @@ class ViewerCamera:
     coefficients: tuple[float, ...]
 
 
-VIEWER_MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
-    "pinhole": ("plumb_bob", ()),
-    "radtan": ("plumb_bob", ("k1", "k2", "p1", "p2", "k3")),
-    "rational": ("rational_polynomial", ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
-    "kannala_brandt": ("kannala_brandt", ("k1", "k2", "k3", "k4")),
-}
-"""The viewers' name of each model, and coec's names of its coefficients in their order. Points on the image do not need
-them."""
-
-
 def viewer_camera(camera: Camera) -> ViewerCamera | None:
     """The camera for viewers. One of a model that they do not know becomes a Kannala-Brandt camera, as for ROS; None if
     that would put points on other pixels."""
@@ -151,8 +141,10 @@ def viewer_camera(camera: Camera) -> ViewerCamera | None:
         known, _ = ros_camera(camera)
     except UnsupportedCameraError:
         return None
-    model, names = VIEWER_MODELS[name_of(known)]
+    model, names = DISTORTION[name_of(known)]
     values = intrinsics_of(known)
+    # As Foxglove's messages call it.
+    model = "kannala_brandt" if model == "equidistant" else model
     return ViewerCamera(known, model, tuple(float(values[name]) for name in names) or (0.0,) * 5)
 
 

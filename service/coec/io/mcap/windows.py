@@ -22,7 +22,7 @@ pairs give equal bytes: nothing in the file tells when or where it was written.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -347,34 +347,30 @@ def records_of(
     Raises:
         WindowError: unreadable, cut off or damaged.
     """
+    with _failing_as_window_error(path), path.open("rb") as stream:
+        yield from reader.read_records(stream, max_unpacked_bytes=max_unpacked_bytes, skip_damaged=skip_damaged)
+
+
+@contextmanager
+def _failing_as_window_error(path: Path) -> Iterator[None]:
     try:
-        with path.open("rb") as stream:
-            yield from reader.read_records(stream, max_unpacked_bytes=max_unpacked_bytes, skip_damaged=skip_damaged)
+        yield
     except OSError as error:
         raise WindowError(f"cannot read {path}: {error.strerror}") from error
     except reader.McapDamagedError as error:
-        raise WindowError(_damage(path, error)) from error
+        message = error.of(path)
+        more = "; the daemon does so for its own at start" if error.is_mcap else ""
+        raise WindowError(f"{message}{more}") from error
 
 
 def _attachment(path: Path, name: str) -> bytes | None:
-    try:
+    with _failing_as_window_error(path):
         return reader.read_attachment(path, name)
-    except OSError as error:
-        raise WindowError(f"cannot read {path}: {error.strerror}") from error
-    except reader.McapDamagedError as error:
-        raise WindowError(_damage(path, error)) from error
-
-
-def _damage(path: Path, error: reader.McapDamagedError) -> str:
-    message = error.of(path)
-    return f"{message}; the daemon does so for its own at start" if error.is_mcap else message
 
 
 def _size(path: Path) -> int:
-    try:
+    with _failing_as_window_error(path):
         return path.stat().st_size
-    except OSError as error:
-        raise WindowError(f"cannot read {path}: {error.strerror}") from error
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
@@ -582,15 +578,7 @@ def _copy(path: Path, file: mcap_writer.WholeFile, leave_out: Callable[[str], bo
                     raise WindowError(f"{path}: a message belongs to no channel")
                 if leave_out(channel.topic):
                     continue
-                file.message(
-                    channel.topic,
-                    channel.message_encoding,
-                    schemas.get(channel.schema_id),
-                    channel.metadata,
-                    record.log_time_ns,
-                    record.sequence,
-                    record.data,
-                )
+                file.copy(record, schemas, channel)
                 pairs += channel.topic.endswith((f"/{IMAGE}", f"/{COMPRESSED}"))
     return window_id, pairs
 

@@ -394,6 +394,12 @@ class WholeFile:
                 self._channels[topic] = self._mcap.channel(topic, encoding, schema, metadata)
             self._mcap.message(self._channels[topic], stamp_ns, sequence, data, packed=packed)
 
+    def copy(self, message: McapMessage, schemas: Mapping[int, Schema], channel: Channel) -> None:
+        """Adds a message of another file, whose channel and schemas are given."""
+        schema = schemas.get(channel.schema_id)
+        stamp_ns, number = message.log_time_ns, message.sequence
+        self.message(channel.topic, channel.message_encoding, schema, channel.metadata, stamp_ns, number, message.data)
+
     def sync(self) -> None:
         """Puts what was added on the disk. Called often, so that the end of a window need not wait for all of it."""
         with self._guarded():
@@ -546,7 +552,7 @@ def _salvaged(part_path: Path, final: Path, progress: Callable[[], None], *, pac
                     case McapMessage():
                         if record.channel_id not in channels:
                             raise McapDamagedError("a message belongs to no channel")
-                        _copy(record, file, schemas, channels[record.channel_id])
+                        file.copy(record, schemas, channels[record.channel_id])
                         messages += 1
                         progress()
     except BaseException:
@@ -556,12 +562,6 @@ def _salvaged(part_path: Path, final: Path, progress: Callable[[], None], *, pac
         file.abandon()
         return None
     return file.finish()
-
-
-def _copy(message: McapMessage, file: WholeFile, schemas: Mapping[int, Schema], channel: Channel) -> None:
-    schema = schemas.get(channel.schema_id)
-    stamp_ns, number = message.log_time_ns, message.sequence
-    file.message(channel.topic, channel.message_encoding, schema, channel.metadata, stamp_ns, number, message.data)
 
 
 def metadata_of(path: Path) -> dict[str, str]:
