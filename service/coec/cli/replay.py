@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -265,10 +266,7 @@ def _document(replayed: ReplayedDrive, differing: tuple[Difference, ...] | None)
         "driven_s": replayed.driven_s,
         "elapsed_s": replayed.elapsed_s,
         "health": replayed.health,
-        "decisions": [
-            {"kind": one.kind, "stamp_ns": one.stamp_ns, "name": one.name, "values": one.values}
-            for one in replayed.decisions
-        ],
+        "decisions": [asdict(one) for one in replayed.decisions],
         "losses": [
             {"place": place, "cause": cause, "count": number}
             for (place, cause), number in sorted(replayed.losses.items())

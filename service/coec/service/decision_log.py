@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -50,8 +50,7 @@ class Decision:
 
     def line(self) -> str:
         """As a line of a log."""
-        document = {"kind": self.kind, "stamp_ns": self.stamp_ns, "name": self.name, "values": self.values}
-        return json.dumps(document, sort_keys=True, separators=(",", ":"))
+        return json.dumps(asdict(self), sort_keys=True, separators=(",", ":"))
 
 
 def decisions_of(records: PairRecords) -> tuple[Decision, ...]:

@@ -368,25 +368,26 @@ def _clock(name: str, samples: StreamSamples) -> Finding:
     return ok("stamps", samples.place, f"{name}: {1e3 * late_s:.0f} ms from stamp to arrival")
 
 
-def _nearest_ns(stamps_ns: Sequence[int], others_ns: Sequence[int]) -> list[int]:
-    """Signed distance from each stamp to the nearest of the others."""
-    others = sorted(others_ns)
-    distances = []
-    for stamp in stamps_ns:
+def _partners(
+    stamps: Sequence[tuple[int, int]], of_others: Sequence[tuple[int, int]], tolerance_s: float
+) -> tuple[float, float]:
+    """Share of the frames with one of the others within a tolerance, and the median signed distance to the nearest,
+    s."""
+    others = sorted(stamp for stamp, _ in of_others)
+    away_ns = []
+    for stamp, _ in stamps:
         index = bisect_left(others, stamp)
-        distances.append(min((one - stamp for one in others[max(index - 1, 0) : index + 1]), key=abs))
-    return distances
+        away_ns.append(min((one - stamp for one in others[max(index - 1, 0) : index + 1]), key=abs))
+    # At both ends of the recorded time a partner may be missing.
+    inside = away_ns[1:-1] or away_ns
+    share = sum(abs(away) <= tolerance_s * NS_PER_S for away in inside) / len(inside)
+    return share, median(away_ns) / NS_PER_S
 
 
 def _in_step(pair: PairConfig, camera: Sequence[tuple[int, int]], lidar: Sequence[tuple[int, int]]) -> Finding:
     """Whether camera and LiDAR are in step, by their stamps."""
-    where = pair.name
-    away_ns = _nearest_ns([stamp for stamp, _ in camera], [stamp for stamp, _ in lidar])
-    tolerance_s = pair.pairing.tolerance_s
-    # At both ends of the recorded time a partner may be missing.
-    inside = away_ns[1:-1] or away_ns
-    share = sum(abs(away) <= tolerance_s * NS_PER_S for away in inside) / len(inside)
-    typical_s = median(away_ns) / NS_PER_S
+    where, tolerance_s = pair.name, pair.pairing.tolerance_s
+    share, typical_s = _partners(camera, lidar, tolerance_s)
     text = f"camera and LiDAR: {100 * share:.0f} % of the frames have a sweep within {tolerance_s:g} s"
     if share == 0.0:
         cause = offset_cause(typical_s, camera[0][0] / NS_PER_S, lidar[0][0] / NS_PER_S)
@@ -399,10 +400,8 @@ def _in_step(pair: PairConfig, camera: Sequence[tuple[int, int]], lidar: Sequenc
 
 
 def _with_motion(pair: PairConfig, camera: Sequence[tuple[int, int]], ego: Sequence[tuple[int, int]]) -> Finding:
-    away_ns = _nearest_ns([stamp for stamp, _ in camera], [stamp for stamp, _ in ego])
-    inside = away_ns[1:-1] or away_ns
     tolerance_s = pair.pairing.motion_tolerance_s
-    share = sum(abs(away) <= tolerance_s * NS_PER_S for away in inside) / len(inside)
+    share, _ = _partners(camera, ego, tolerance_s)
     text = f"ego-motion: {100 * share:.0f} % of the frames have one within {tolerance_s:g} s"
     if share < PARTNERS:
         advice = "put both on one clock; without ego-motion sweeps are not compensated, and standing is not seen"

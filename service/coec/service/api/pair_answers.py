@@ -107,39 +107,22 @@ class Overlays:
             if key in self._cache:
                 self._cache.move_to_end(key)
                 return self._cache[key]
-        rendered: Future[bytes | Reason] = Future()
-        self.request(path, T_camera_lidar, title, rendered.set_result, OVERLAY_TIMEOUT_S)
+        rendered: Future[worker_jobs.JobOutcome] = Future()
+        job = worker_jobs.overlay(self._pair, path, T_camera_lidar, title, rendered.set_result, OVERLAY_TIMEOUT_S)
+        self._worker.submit(job)
         try:
-            picture = rendered.result(OVERLAY_TIMEOUT_S)
+            outcome = rendered.result(OVERLAY_TIMEOUT_S)
         except TimeoutError as error:
             raise OverlayUnavailableError("the worker is busy with a window; retry") from error
-        if isinstance(picture, Reason):
-            raise OverlayUnavailableError(picture.text)
+        if outcome.reason is not None:
+            raise OverlayUnavailableError(outcome.reason.text)
+        assert isinstance(outcome.answer, worker_jobs.RenderedImage)
+        picture = outcome.answer.jpeg
         with self._lock:
             self._cache[key] = picture
             while len(self._cache) > CACHED_OVERLAYS:
                 self._cache.popitem(last=False)
         return picture
-
-    def request(
-        self,
-        path: Path,
-        T_camera_lidar: Matrix4,
-        title: str,
-        done: Callable[[bytes | Reason], None],
-        deadline_s: float | None = None,
-    ) -> None:
-        """Asks for the picture without waiting. `done` is called once, with the picture or with the reason why there is
-        none, at the latest after `deadline_s` if the worker is busy (None: the default of pictures)."""
-
-        def on_outcome(outcome: worker_jobs.JobOutcome) -> None:
-            match outcome:
-                case worker_jobs.JobOutcome(answer=worker_jobs.RenderedImage(jpeg)):
-                    done(jpeg)
-                case worker_jobs.JobOutcome(reason=Reason() as reason):
-                    done(reason)
-
-        self._worker.submit(worker_jobs.overlay(self._pair, path, T_camera_lidar, title, on_outcome, deadline_s))
 
 
 class PairAnswers:

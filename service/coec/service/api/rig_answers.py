@@ -66,37 +66,27 @@ class RigAnswers:
 def reply_of(vehicle: str, known: RigSnapshot) -> rig_state.RigReply:
     """What is known of the rig in its wire form."""
     rig = known.rig
-    if rig is None:
-        return rig_state.RigReply(
-            vehicle=vehicle,
-            stamp_ns=None,
-            sensors=() if known.graph is None else _unknown_sensors(known.graph, known.why),
-            nobody=None,
-            disturbed={},
-            joint=None,
-            correction=None,
-            lidars=tuple(_lidars(one) for one in known.lidars),
-            reasons=reasons_of(known.why),
-            looks={},
-            losses=dict(known.losses),
-        )
-    posterior, last = rig.believed.posterior, rig.correction
+    posterior, last = (None, None) if rig is None else (rig.believed.posterior, rig.correction)
+    if rig is not None:
+        sensors = tuple(_sensor(rig, sensor) for sensor in rig.sensors)
+    else:
+        sensors = () if known.graph is None else _unknown_sensors(known.graph, known.why)
     return rig_state.RigReply(
         vehicle=vehicle,
-        stamp_ns=known.stamp_ns,
-        sensors=tuple(_sensor(rig, sensor) for sensor in rig.sensors),
+        stamp_ns=None if rig is None else known.stamp_ns,
+        sensors=sensors,
         nobody=None if posterior is None else _share(posterior.nobody),
         disturbed={} if posterior is None else {name: _share(p) for name, p in posterior.disturbed.items()},
-        joint=None if rig.joint is None else _joint(rig, rig.joint),
+        joint=None if rig is None or rig.joint is None else _joint(rig, rig.joint),
         correction=None
         if last is None or known.from_ns is None
         else rig_state.RigCorrection(
             stamp_ns=last.stamp_ns, from_ns=known.from_ns, sensors=last.sensors, pairs=tuple(last.pairs)
         ),
-        move=None if rig.move is None else _move(rig.move),
+        move=None if rig is None or rig.move is None else _move(rig.move),
         lidars=tuple(_lidars(one) for one in known.lidars),
         reasons=reasons_of(known.why),
-        looks=dict(rig.observations),
+        looks={} if rig is None else dict(rig.observations),
         losses=dict(known.losses),
     )
 
