@@ -27,10 +27,10 @@ from coec.schemas.keys import Keys
 from coec.service import ros_output as ros
 from coec.service.api import metrics
 from coec.service.api.authorization import Authority, CommandHandler, CommandRules
-from coec.service.api.command_execution import Commands, RigCommands
+from coec.service.api.command_execution import PairCommands, RigCommands
 from coec.service.api.metrics import LabelledHistogram, MetricsInput, TextFormat
 from coec.service.api.metrics_server import MetricsServer, pages
-from coec.service.api.pair_answers import PairAnswers, PendingPairAnswers, PendingPairCommands
+from coec.service.api.pair_answers import PairAnswers, PendingPairAnswers
 from coec.service.api.problems import RouterMonitor
 from coec.service.api.reply_builders import SerializedReply, budget_status_of, worker_status_of
 from coec.service.api.rig_answers import RigAnswers
@@ -167,7 +167,7 @@ class Daemon:
         while self._vehicle.turn(0.0):  # so that a reply exists before the first query
             pass
         pending = self._pending_pairs.open(config, self._context)
-        self._commands: dict[str, Commands | PendingPairCommands] = {
+        self._commands: dict[str, PairCommands] = {
             **{name: pair.commands for name, pair in self._pairs.items()},
             **{name: answers.commands for name, answers in pending.items()},
         }

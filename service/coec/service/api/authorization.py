@@ -19,8 +19,7 @@ from coec.io.zenoh.command_auth import AuthenticatedCommand, CommandListener
 from coec.schemas.commands import COMMAND_NAMES, MAX_REASON, REASON, ProvenCommand, arguments_of
 from coec.schemas.keys import RIG, CommandSelector, parse_command_selector
 from coec.schemas.message import from_json
-from coec.service.api.command_execution import Commands, RigCommands
-from coec.service.api.pair_answers import PendingPairCommands
+from coec.service.api.command_execution import PairCommands, RigCommands
 from coec.service.api.reply_builders import answer_of
 
 
@@ -180,7 +179,7 @@ class CommandHandler:
     def __init__(
         self,
         rules: CommandRules,
-        commands: Mapping[str, Commands | PendingPairCommands],
+        commands: Mapping[str, PairCommands],
         rig: RigCommands | None = None,
     ) -> None:
         """`commands` are those of each pair, and may be replaced while queries come; `rig` are those for all pairs."""
@@ -224,7 +223,7 @@ class CommandHandler:
             else self._answer_authenticated(rules, pair, name, received, request)
         )
 
-    def _of(self, pair: str) -> Commands | PendingPairCommands | RigCommands:
+    def _of(self, pair: str) -> PairCommands | RigCommands:
         return self._rig if pair == RIG and self._rig is not None else self._pairs[pair]
 
     def _answer_authenticated(

@@ -20,7 +20,6 @@ from coec.errors import CoecError, NotFoundError
 from coec.schemas.commands import CANDIDATE, COMMAND_NAMES, REASON, Acknowledgement
 from coec.schemas.keys import RIG
 from coec.schemas.rig_state import RigReply
-from coec.service.api.pair_answers import PendingPairCommands
 from coec.service.engine.commands import EXPIRED, PairCommand
 from coec.service.ingest.inbox import STARTED, BusyError, Inbox
 from coec.service.records.pair_store import PairStore
@@ -84,27 +83,72 @@ TIMEOUT_S = 4.0
 """Time to begin a command, and again to end it, s: together below the 10 s after which clients give up."""
 
 
-class Commands:
-    """The commands of one pair. For any thread."""
+class _CountedCommands:
+    """What all commands of one pair have in common. For any thread."""
 
-    def __init__(self, pair: str, vehicle: str, store: PairStore, inbox: Inbox) -> None:
+    def __init__(self, pair: str, vehicle: str) -> None:
         self._pair = pair
         self._vehicle = vehicle
-        self._store = store
-        self._inbox = inbox
-        self._rate = RateLimit()
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
-
-    def reserve_for(self, proven: Iterable[str]) -> None:
-        """Reserves a rate for each sender who can prove his name, so that others cannot use it up. The names are those
-        of `payloads.proven_sender`."""
-        self._rate.reserve_for(proven)
 
     def counted(self) -> dict[str, int]:
         """Number of commands since the start, by name and outcome: accepted, refused, or not allowed."""
         with self._lock:
             return dict(self._counts)
+
+    def note_refused(self, name: str, sender: str, why: CoecError) -> None:
+        """Counts a command that its sender may not give. Only the first and then every 2^n-th is logged, so that
+        senders without rights cannot fill the disk."""
+        known = name if name in COMMAND_NAMES else "unknown"
+        count = self._count(f"{known}_not_allowed")
+        if count & (count - 1) == 0:
+            fields = {"pair": self._pair, "command": known, "sender": sender, "code": why.reply_code}
+            _log.warning(f"a command was denied: {why}", extra={"fields": {**fields, "count": count}})
+
+    def _count(self, outcome: str) -> int:
+        with self._lock:
+            self._counts[outcome] += 1
+            return self._counts[outcome]
+
+    def _refuse(self, name: str, code: str, text: str) -> Acknowledgement:
+        return Acknowledgement(
+            vehicle=self._vehicle, pair=self._pair, command=name, accepted=False, code=code, text=text
+        )
+
+
+class PendingPairCommands(_CountedCommands):
+    """The commands of a pair without a nominal calibration: every command is understood, and refused with what is
+    missing."""
+
+    def __init__(self, pair: str, vehicle: str, missing: Callable[[], CoecError]) -> None:
+        super().__init__(pair, vehicle)
+        self._missing = missing
+
+    def reserve_for(self, proven: Iterable[str]) -> None:
+        """Does nothing: there is no rate limit here."""
+
+    def carry_out(self, name: str, arguments: dict[str, Any], sender: str, deadline_s: float = 0.0) -> Acknowledgement:
+        """Refuses the command, and says why."""
+        del arguments, sender, deadline_s
+        self._count(f"{name}_refused")
+        missing = self._missing()
+        return self._refuse(name, missing.reply_code, str(missing))
+
+
+class Commands(_CountedCommands):
+    """The commands of one pair. For any thread."""
+
+    def __init__(self, pair: str, vehicle: str, store: PairStore, inbox: Inbox) -> None:
+        super().__init__(pair, vehicle)
+        self._store = store
+        self._inbox = inbox
+        self._rate = RateLimit()
+
+    def reserve_for(self, proven: Iterable[str]) -> None:
+        """Reserves a rate for each sender who can prove his name, so that others cannot use it up. The names are those
+        of `payloads.proven_sender`."""
+        self._rate.reserve_for(proven)
 
     def carry_out(
         self, name: str, arguments: dict[str, Any], sender: str, deadline_s: float = math.inf
@@ -136,25 +180,8 @@ class Commands:
             acknowledged = self._refuse(name, code, text)
         if acknowledged.accepted:
             acknowledged = acknowledged.model_copy(update={"durable": self._store.is_on_disk()})
-        with self._lock:
-            self._counts[f"{name}_{'accepted' if acknowledged.accepted else 'refused'}"] += 1
+        self._count(f"{name}_{'accepted' if acknowledged.accepted else 'refused'}")
         return acknowledged
-
-    def note_refused(self, name: str, sender: str, why: CoecError) -> None:
-        """Counts a command that its sender may not give. Only the first and then every 2^n-th is logged, so that
-        senders without rights cannot fill the disk."""
-        known = name if name in COMMAND_NAMES else "unknown"
-        with self._lock:
-            self._counts[f"{known}_not_allowed"] += 1
-            count = self._counts[f"{known}_not_allowed"]
-        if count & (count - 1) == 0:
-            fields = {"pair": self._pair, "command": known, "sender": sender, "code": why.reply_code}
-            _log.warning(f"a command was denied: {why}", extra={"fields": {**fields, "count": count}})
-
-    def _refuse(self, name: str, code: str, text: str) -> Acknowledgement:
-        return Acknowledgement(
-            vehicle=self._vehicle, pair=self._pair, command=name, accepted=False, code=code, text=text
-        )
 
 
 PairCommands = Commands | PendingPairCommands

@@ -15,7 +15,6 @@ from typing import Literal, get_args
 from coec.calibration.state_machine import HealthState
 from coec.schemas import replies
 from coec.schemas.rig_state import RigReply, SensorState
-from coec.service.api.reply_builders import AXES, UNITS
 from coec.service.api.uplink import Uplink
 from coec.service.timing import Histogram
 
@@ -193,7 +192,7 @@ def _of_health(
 def _axes(choose: Callable[[replies.HealthReply], replies.Maybe6 | None], view: MetricsInput) -> Iterable[MetricSample]:
     """Samples by pair, axis and unit."""
     for pair, reply in view.health.items():
-        for axis, unit, value in zip(AXES, UNITS, choose(reply) or (), strict=False):
+        for axis, unit, value in zip(replies.AXES, replies.UNITS, choose(reply) or (), strict=False):
             yield (pair, axis, unit), value
 
 

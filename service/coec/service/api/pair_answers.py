@@ -6,12 +6,12 @@ thread of the service is held up; the latest ones are cached.
 
 import threading
 import time
-from collections import Counter, OrderedDict
-from collections.abc import Callable, Sequence
+from collections import OrderedDict
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Never
+from typing import Never
 
 from coec.calibration.state import CalibrationStatus, Health
 from coec.calibration.state_machine import HealthState
@@ -24,9 +24,9 @@ from coec.io.ros.messages import CAMERA_INFO
 from coec.io.serialise import reasons_of, result_of
 from coec.io.zenoh.bus import Answer
 from coec.schemas import replies
-from coec.schemas.commands import COMMAND_NAMES, Acknowledgement
 from coec.schemas.keys import Format
 from coec.service.api import problems, reply_builders
+from coec.service.api.command_execution import PendingPairCommands
 from coec.service.discovery import info_topic_of
 from coec.service.discovery_listener import NominalStatus
 from coec.service.engine.messages import PairSnapshot
@@ -403,7 +403,7 @@ class PendingPairAnswers:
         self._since_ns = time.time_ns()
         self._published: object = None
         self._fault: tuple[Reason, ...] = ()
-        self.commands = PendingPairCommands(pair.name, vehicle, lambda: _sentence(self._nominal))
+        self.commands = PendingPairCommands(pair.name, vehicle, lambda: PendingPairError(_sentence(self._nominal)))
         self.renew()
 
     @property
@@ -451,7 +451,7 @@ class PendingPairAnswers:
         return replies.PairStatus(
             name=self.name,
             ego=replies.StreamStatus() if self._pair.ego is not None else None,
-            commands=self.commands.counts,
+            commands=self.commands.counted(),
             losses=dict(self._nominal.losses),
             awaits=reasons_of(self._nominal.awaits),
             found=dict(self._nominal.origins),
@@ -469,48 +469,6 @@ class PendingPairAnswers:
             PendingPairError: there is no nominal calibration yet.
         """
         raise PendingPairError(_sentence(self._nominal))
-
-
-class PendingPairCommands:
-    """The commands of one pair: every command is understood, and refused with what is missing."""
-
-    def __init__(self, pair: str, vehicle: str, sentence: Callable[[], str]) -> None:
-        self._pair = pair
-        self._vehicle = vehicle
-        self._sentence = sentence
-        self._lock = threading.Lock()
-        self._counts: Counter[str] = Counter()
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Commands since the start, by name and outcome."""
-        with self._lock:
-            return dict(self._counts)
-
-    def carry_out(self, name: str, arguments: dict[str, Any], sender: str, deadline_s: float = 0.0) -> Acknowledgement:
-        """Refuses the command, and says why."""
-        del arguments, sender, deadline_s
-        self._count(f"{name}_refused")
-        return Acknowledgement(
-            vehicle=self._vehicle,
-            pair=self._pair,
-            command=name,
-            accepted=False,
-            code=PendingPairError.reply_code,
-            text=self._sentence(),
-        )
-
-    def reserve_for(self, senders: Sequence[str]) -> None:
-        """Does nothing: there is no rate limit here."""
-
-    def note_refused(self, name: str, sender: str, why: CoecError) -> None:
-        """Counts a command that its sender may not give."""
-        del sender, why
-        self._count(f"{name if name in COMMAND_NAMES else 'unknown'}_not_allowed")
-
-    def _count(self, what: str) -> None:
-        with self._lock:
-            self._counts[what] += 1
 
 
 def _sentence(nominal: NominalStatus) -> str:

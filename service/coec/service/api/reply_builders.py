@@ -18,7 +18,7 @@ import coec
 from coec.calibration.baseline import BaselineDrift
 from coec.calibration.state import CalibrationStatus, Health, PairState, Provenance
 from coec.calibration.state_machine import AlarmRecord, HealthState, step_between
-from coec.calibration.types import Decision, Estimate, Reason, Rig, Uncertainty
+from coec.calibration.types import NS_PER_S, Decision, Estimate, Reason, Rig, Uncertainty
 from coec.config import CameraIntrinsics, PairConfig
 from coec.geometry import se3
 from coec.io import serialise
@@ -33,13 +33,9 @@ from coec.service.engine.pair import HELD
 from coec.service.ingest.decoder import CAMERA, EGO, LIDAR, StreamCounts
 from coec.service.ingest.inbox import Arrivals
 from coec.service.ingest.pair_stream import StreamStatistics
-from coec.service.timing import NS_PER_S
 from coec.service.worker import compilation
 from coec.service.worker.supervisor import Worker, WorkerState
 from coec.service.worker.worker_jobs import Fate
-
-AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
-UNITS: tuple[Literal["deg", "m"], ...] = ("deg", "deg", "deg", "m", "m", "m")
 
 
 def axes_of(result: replies.CalibrationResult | None, status: CalibrationStatus) -> replies.Axes:
@@ -47,12 +43,12 @@ def axes_of(result: replies.CalibrationResult | None, status: CalibrationStatus)
 
     def axis(index: int) -> replies.AxisReply:
         if result is None:
-            return replies.AxisReply(status="not_accepted", sigma=None, correction=0.0, unit=UNITS[index])
+            return replies.AxisReply(status="not_accepted", sigma=None, correction=0.0, unit=replies.UNITS[index])
         return replies.AxisReply(
             status=_axis_status(result, index, status),
             sigma=result.sigma[index],
             correction=result.correction[index],
-            unit=UNITS[index],
+            unit=replies.UNITS[index],
         )
 
     return replies.Axes(rx=axis(0), ry=axis(1), rz=axis(2), tx=axis(3), ty=axis(4), tz=axis(5))
@@ -130,7 +126,7 @@ def axes_of_served(state: PairState, rig: Rig, accepted: replies.CalibrationResu
         name: getattr(axes, name).model_copy(
             update={"correction": correction[index], "sigma": sigma[index] if accepted.solved[index] else None}
         )
-        for index, name in enumerate(AXES)
+        for index, name in enumerate(replies.AXES)
     }
     return replies.Axes(**updated)
 
