@@ -260,6 +260,23 @@ class MessageReader:
         return bytes(self._chunk[at : at + length])
 
 
+def read_metadata(path: Path, name: str) -> dict[str, str]:
+    """The metadata with a name that come before the first message; empty if there are none.
+
+    Raises:
+        McapDamaged: the file is damaged at its beginning.
+        OSError: the file cannot be read.
+    """
+    with path.open("rb") as stream:
+        for record in read_records(stream):
+            match record:
+                case Metadata() if record.name == name:
+                    return record.values
+                case McapMessage():
+                    break
+    return {}
+
+
 def read_attachment(path: Path, name: str) -> bytes | None:
     """The last attachment with a name, found by the index at the end of the file; None if there is none.
 

@@ -316,13 +316,8 @@ def metadata_of(path: Path) -> dict[str, str]:
     Raises:
         WindowError: unreadable or damaged at its beginning.
     """
-    for record in records_of(path):
-        match record:
-            case reader.Metadata() if record.name == METADATA:
-                return record.values
-            case reader.McapMessage():
-                break
-    return {}
+    with _failing_as_window_error(path):
+        return reader.read_metadata(path, METADATA)
 
 
 def is_window(path: Path) -> bool:

@@ -31,7 +31,16 @@ from coec import __version__
 from coec.calibration.types import Frame, Matrix4, Rig
 from coec.errors import RecordingError, WindowError
 from coec.io import storage
-from coec.io.mcap.reader import MAGIC, Channel, McapDamagedError, McapMessage, Metadata, Schema, read_records
+from coec.io.mcap.reader import (
+    MAGIC,
+    Channel,
+    McapDamagedError,
+    McapMessage,
+    Metadata,
+    Schema,
+    read_metadata,
+    read_records,
+)
 from coec.io.ros import messages
 from coec.io.ros.topics import FrameTopics, PairTopics, TopicMessage, qos_of
 
@@ -572,16 +581,9 @@ def metadata_of(path: Path) -> dict[str, str]:
         OSError: it cannot be read.
     """
     try:
-        with path.open("rb") as stream:
-            for record in read_records(stream):
-                match record:
-                    case Metadata() if record.name == METADATA:
-                        return record.values
-                    case McapMessage():
-                        break
+        return read_metadata(path, METADATA)
     except McapDamagedError as error:
         raise WindowError(error.of(path)) from error
-    return {}
 
 
 # --- bags -------------------------------------------------------------------------------------------------------------
