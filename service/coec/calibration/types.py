@@ -24,6 +24,8 @@ from coec.geometry.cameras import Camera
 Matrix4 = NDArray[np.float64]
 T = TypeVar("T")
 
+NS_PER_S = 1_000_000_000
+
 
 class ImageFormat(StrEnum):
     """How the bytes of an image are laid out. Raw ones are named as in sensor_msgs/image_encodings.hpp."""

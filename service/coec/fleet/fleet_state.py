@@ -13,9 +13,7 @@ from typing import Final, get_args
 from coec.errors import DecodeError
 from coec.schemas.documents import SEEN, Connectivity, FleetNow, PairNow
 from coec.schemas.heartbeat import LastWord, decode_heartbeat
-from coec.schemas.replies import HealthState
-
-AXES: Final = ("rx", "ry", "rz", "tx", "ty", "tz")
+from coec.schemas.replies import AXES, HealthState
 
 MAX_PAIRS: Final = 200_000
 """How many pairs are kept, some 3 kB each. So a flood of words takes no more memory than a fleet does."""

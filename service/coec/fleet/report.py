@@ -14,6 +14,7 @@ from typing import Any, cast
 from urllib.parse import quote
 
 from coec.calibration.baseline import poisson_most
+from coec.calibration.types import NS_PER_S
 from coec.errors import SourceError, UsageError
 from coec.io import user_files
 from coec.schemas import documents
@@ -35,8 +36,6 @@ def optional_library(name: str) -> Any:
             "tables of many windows need the optional extra `fleet`: pip install 'coec[fleet]'"
         ) from error
 
-
-NS_PER_S = 1_000_000_000
 
 UNDATED, NAMELESS = "unknown", "unknown"
 """Folder names for date and vehicle of windows that could not be read. If a vehicle happens to have this name, its rows

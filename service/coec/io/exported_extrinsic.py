@@ -11,18 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 import coec
+from coec.calibration.types import NS_PER_S
 from coec.config import CameraIntrinsics
 from coec.errors import OutputError
 from coec.geometry import cameras, se3
 from coec.io.rig_files import camera_of, intrinsics_config
 from coec.io.serialise import estimate_of, intrinsics_of, matrix_of, number_or_null
-from coec.schemas.replies import CalibrationResult, ExtrinsicReply, Intrinsics
+from coec.schemas.replies import AXES, CalibrationResult, ExtrinsicReply, Intrinsics
 
 Matrix = NDArray[np.float64]
 
-AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
-
-NS_PER_S = 1_000_000_000
 
 REFUSED = "REFUSED - do not use"
 """Stands above every pose of a refused result that can be copied."""

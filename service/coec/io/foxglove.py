@@ -7,13 +7,11 @@ import foxglove
 import numpy as np
 from foxglove import Channel, Context, channels, messages
 
-from coec.calibration.types import EncodedImage
+from coec.calibration.types import NS_PER_S, EncodedImage
 from coec.errors import UnavailableError
 from coec.geometry.cameras import Camera
 from coec.geometry.se3 import inverse, quaternion_xyzw_from_rotation
 from coec.io import viewer_scene
-
-NS_PER_S = 1_000_000_000
 
 BACKLOG = 32
 """Most messages that wait for a slow viewer, some four pictures; the oldest are dropped first."""

@@ -114,6 +114,13 @@ class MetricReply(Part):
     passed: bool
 
 
+AXES: Final = ("rx", "ry", "rz", "tx", "ty", "tz")
+
+AxisUnit = Literal["deg", "m"]
+
+UNITS: Final[tuple[AxisUnit, ...]] = ("deg", "deg", "deg", "m", "m", "m")
+
+
 class AxisReply(Part):
     """One degree of freedom, about or along an axis of the camera."""
 
@@ -122,7 +129,7 @@ class AxisReply(Part):
     )
     sigma: float | None = Field(description="standard deviation in `unit`; null if not estimated")
     correction: float = Field(description="correction from the nominal calibration, in `unit`")
-    unit: Literal["deg", "m"]
+    unit: AxisUnit
 
 
 class Axes(Part):

@@ -15,12 +15,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from coec.calibration.types import NS_PER_S
 from coec.errors import SourceError, UsageError
 from coec.reports.formatting import count
 from coec.reports.page import Facts, Page, Section, Table, Text, write
 from coec.service.records.history import CheckLog, PairHistory
 from coec.service.records.pair_store import PairRecords
-from coec.service.timing import NS_PER_S
 
 KINDS = ("check", "estimate", "extrinsic", "state")
 """Of decisions, in the order in which those of one stamp are listed."""

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import cast
 
 from coec.calibration.frames.window import SliceClosed
-from coec.calibration.types import CameraFrame, Frame
+from coec.calibration.types import NS_PER_S, CameraFrame, Frame
 from coec.config import BudgetConfig, Config, PairConfig
 from coec.errors import SourceError
 from coec.io.disk_writer import DiskWriter
@@ -42,7 +42,7 @@ from coec.service.recording.recorder import RecordBetween, RecordingThread, Reco
 from coec.service.recording.window_store import WindowStore
 from coec.service.records.pair_store import PairRecords
 from coec.service.records.state_store import StateStore
-from coec.service.timing import NS_PER_S, Clock
+from coec.service.timing import Clock
 from coec.service.vehicle_context import VehicleContext
 from coec.service.worker.supervisor import Worker, WorkerState
 from coec.service.worker.worker_jobs import JobOutcome, Kind, WorkerJob

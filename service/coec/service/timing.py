@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-NS_PER_S = 1_000_000_000
+from coec.calibration.types import NS_PER_S
 
 
 class Clock:

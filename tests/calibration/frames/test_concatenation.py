@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.frames.lidar_origin import OriginCheck, SeveralOrigins, apparent_origin
+from coec.calibration.frames.lidar_origin import OriginCheck, SeveralOrigins
 from coec.calibration.types import LidarFrame
 from coec.geometry import se3
 from support.scenes import ROOF_POSE, sweep_in_frame, turning_sweep
@@ -42,7 +42,7 @@ def noisy(seed: int) -> LidarFrame:
 def test_several_lidars_in_one_cloud_are_reported_with_their_places(
     poses: tuple[NDArray[np.float64], ...], seed: int
 ) -> None:
-    result = apparent_origin(joined(*(sweep_in_frame(noisy(seed + n), T) for n, T in enumerate(poses))))
+    result = OriginCheck().inspect(joined(*(sweep_in_frame(noisy(seed + n), T) for n, T in enumerate(poses))))
     assert isinstance(result, SeveralOrigins)
     np.testing.assert_allclose(result.origins_m, [T[:3, 3] for T in poses[:2]], atol=0.15)
     assert "concatenated" in result.sentence
@@ -51,14 +51,14 @@ def test_several_lidars_in_one_cloud_are_reported_with_their_places(
 @pytest.mark.parametrize("share", [0.75, 0.5])
 def test_a_small_lidar_next_to_the_one_of_the_frame_is_reported(share: float) -> None:
     cloud = joined(turning_sweep(1), thinned(sweep_in_frame(turning_sweep(2), LEFT), share))
-    assert isinstance(apparent_origin(cloud), SeveralOrigins)
+    assert isinstance(OriginCheck().inspect(cloud), SeveralOrigins)
 
 
 def test_rings_of_their_own_numbers_are_reported_too() -> None:
     other = sweep_in_frame(turning_sweep(2), LEFT)
     assert other.ring is not None
     cloud = joined(sweep_in_frame(turning_sweep(1), ROOF_POSE), replace(other, ring=other.ring + np.uint16(16)))
-    assert isinstance(apparent_origin(cloud), SeveralOrigins)
+    assert isinstance(OriginCheck().inspect(cloud), SeveralOrigins)
 
 
 def test_the_next_cloud_is_distinguished_from_what_was_discovered() -> None:
@@ -71,7 +71,7 @@ def test_the_next_cloud_is_distinguished_from_what_was_discovered() -> None:
 
 @pytest.mark.parametrize("walkers", [0.0, 0.2, 0.4])
 def test_a_crowd_is_no_second_lidar(walkers: float) -> None:
-    assert apparent_origin(turning_sweep(noise_rad=np.radians(0.1), walkers=walkers)) is None
+    assert OriginCheck().inspect(turning_sweep(noise_rad=np.radians(0.1), walkers=walkers)) is None
 
 
 @pytest.mark.parametrize("speed_mps", [15.0, 25.0, 40.0])
@@ -80,4 +80,4 @@ def test_a_lidar_that_drove_on_while_it_turned_is_one(speed_mps: float) -> None:
     sweep = turning_sweep(noise_rad=np.radians(0.05))
     ahead_m = speed_mps * np.linspace(-0.1, 0.0, len(sweep.xyz_m), dtype=np.float32)
     moved = sweep.xyz_m + ahead_m[:, None] * np.array([1.0, 0.0, 0.0], np.float32)
-    assert not isinstance(apparent_origin(replace(sweep, xyz_m=moved)), SeveralOrigins)
+    assert not isinstance(OriginCheck().inspect(replace(sweep, xyz_m=moved)), SeveralOrigins)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.frames.lidar_origin import GIVE_UP, ApparentOrigin, OriginCheck, apparent_origin, from_origin
+from coec.calibration.frames.lidar_origin import GIVE_UP, ApparentOrigin, OriginCheck, from_origin
 from coec.calibration.types import LidarFrame
 from coec.geometry import se3
 from support.scenes import ROOF_POSE, TILTED_ROOF_POSE, sweep_in_frame, turning_sweep
@@ -29,7 +29,7 @@ def test_without_a_pose_the_points_stay_as_they_are_to_the_bit() -> None:
 @pytest.mark.parametrize("noise_deg", [0.0, 0.1])
 @pytest.mark.parametrize("walkers", [0.0, 0.2])
 def test_a_right_origin_is_not_contradicted(noise_deg: float, walkers: float) -> None:
-    assert apparent_origin(turning_sweep(noise_rad=np.radians(noise_deg), walkers=walkers)) is None
+    assert OriginCheck().inspect(turning_sweep(noise_rad=np.radians(noise_deg), walkers=walkers)) is None
 
 
 @pytest.mark.parametrize("T", [ROOF_POSE, TILTED_ROOF_POSE])
@@ -37,7 +37,7 @@ def test_a_right_origin_is_not_contradicted(noise_deg: float, walkers: float) ->
 def test_a_wrong_origin_is_reported_with_the_right_one(
     T: NDArray[np.float64], noise_deg: float, walkers: float
 ) -> None:
-    result = apparent_origin(sweep_in_frame(turning_sweep(noise_rad=np.radians(noise_deg), walkers=walkers), T))
+    result = OriginCheck().inspect(sweep_in_frame(turning_sweep(noise_rad=np.radians(noise_deg), walkers=walkers), T))
     assert isinstance(result, ApparentOrigin)
     np.testing.assert_allclose(result.origin_m, T[:3, 3], atol=0.1)
     assert "look as if measured from (+1." in result.sentence
@@ -45,7 +45,7 @@ def test_a_wrong_origin_is_reported_with_the_right_one(
 
 def test_a_turned_frame_is_no_wrong_origin() -> None:
     T = se3.exp(np.array([0.1, 0.15, 0.4, 0.0, 0.0, 0.0]))
-    assert apparent_origin(sweep_in_frame(turning_sweep(), T)) is None
+    assert OriginCheck().inspect(sweep_in_frame(turning_sweep(), T)) is None
 
 
 def numbered(sweep: LidarFrame, ring: NDArray[np.integer] | None) -> LidarFrame:
@@ -57,7 +57,7 @@ def test_where_rings_are_none_nothing_is_reported(kind: str) -> None:
     sweep = sweep_in_frame(turning_sweep(), ROOF_POSE)
     count = len(sweep.xyz_m)
     ring = {"none": None, "constant": np.zeros(count, int), "random": np.random.default_rng(0).integers(0, 64, count)}
-    assert apparent_origin(numbered(sweep, ring[kind])) is None
+    assert OriginCheck().inspect(numbered(sweep, ring[kind])) is None
 
 
 def test_a_check_gives_up_where_no_cones_explain_the_rings() -> None:
@@ -80,4 +80,4 @@ def test_the_next_sweep_is_reported_too() -> None:
 def test_too_few_points_say_nothing(points: int) -> None:
     sweep = sweep_in_frame(turning_sweep(), ROOF_POSE)
     assert sweep.ring is not None
-    assert apparent_origin(replace(sweep, xyz_m=sweep.xyz_m[:points], ring=sweep.ring[:points])) is None
+    assert OriginCheck().inspect(replace(sweep, xyz_m=sweep.xyz_m[:points], ring=sweep.ring[:points])) is None

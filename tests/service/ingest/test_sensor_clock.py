@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from coec.service.timing import MIN_SILENCE_S, NS_PER_S, SILENT_GAPS, SensorClock
+from coec.calibration.types import NS_PER_S
+from coec.service.timing import MIN_SILENCE_S, SILENT_GAPS, SensorClock
 
 
 @pytest.mark.parametrize("rate", [0.5, 1.0, 20.0, 400.0])

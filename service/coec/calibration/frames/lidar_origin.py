@@ -10,7 +10,7 @@ LiDAR's points are a block of the message. Each block lies on cones of its own, 
 
 Drivers often give clouds in the vehicle's frame. Directions and ranges, and with them every range edge, then start from
 a place where no sensor is. `from_origin` undoes that with the stated pose of the LiDAR in the cloud's frame;
-`apparent_origin` finds out whether the points contradict the stated origin.
+`OriginCheck` finds out whether the points contradict the stated origin.
 """
 
 from __future__ import annotations
@@ -307,12 +307,6 @@ def unordered(sweep: LidarFrame) -> LidarFrame:
     if sweep.ring is None:
         return sweep
     return replace(sweep, ring=None, recognitions=(*sweep.recognitions, NO_SCAN_LINES))
-
-
-def apparent_origin(sweep: LidarFrame) -> ApparentOrigin | SeveralOrigins | None:
-    """From where the points look measured, if they contradict the origin of their frame; None if they do not, or if
-    that is unknown. See `OriginCheck`."""
-    return OriginCheck().inspect(sweep)
 
 
 class OriginCheck:

@@ -13,10 +13,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.types import CameraFrame, EgoMotion, FramePair, LidarFrame, SweepTiming
+from coec.calibration.types import NS_PER_S, CameraFrame, EgoMotion, FramePair, LidarFrame, SweepTiming
 from coec.config import PairingConfig
 
-NS_PER_S = 1_000_000_000
 AGREEING_STAMPS = 5
 """This many consecutive frames must agree on a new time line before it is believed: half a second at 10 Hz."""
 

@@ -28,14 +28,20 @@ from math import ceil, cos, pi, radians
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.types import FramePair, ImageInspector, ImageQuality, ImageReducer, LidarFrame, Matrix4, Rig
+from coec.calibration.types import (
+    NS_PER_S,
+    FramePair,
+    ImageInspector,
+    ImageQuality,
+    ImageReducer,
+    LidarFrame,
+    Matrix4,
+    Rig,
+)
 from coec.config import MonitorConfig, WindowConfig
 from coec.errors import DecodeError
 from coec.geometry.cameras import Camera, in_image, project_point
 from coec.geometry.points import BAND_RAD, distinct_rings
-
-NS_PER_S = 1_000_000_000
-
 
 MIB = 2**20
 

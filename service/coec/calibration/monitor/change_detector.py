@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.baseline import BaselineDrift, chi2_quantile
 from coec.calibration.monitor import sensor_faults, sequential_tests
-from coec.calibration.types import Metric
+from coec.calibration.types import NS_PER_S, Metric
 from coec.config import MonitorConfig
 
 ROTATIONS = sequential_tests.TestedAxes(
@@ -69,8 +69,6 @@ CONTRADICTION2 = chi2_quantile(1.0 - 1e-4, sequential_tests.AXES)
 other. The scene of a standing vehicle stays, so that only what is new at every check separates them."""
 
 S_PER_H = 3600.0
-NS_PER_S = 1_000_000_000
-
 ROTATION_AXES, TRANSLATION_AXES = slice(0, 3), slice(3, 6)
 
 

@@ -26,7 +26,7 @@ from coec.calibration.baseline import chi2_quantile
 from coec.calibration.rig.edge_observations import EdgeHistory, EdgeObservation, steps_at
 from coec.calibration.rig.graph import Edge, RigGraph, Sensor, SensorKind
 from coec.calibration.rig.moved_sensors import SEEN, Moved, MovePosterior, who_moved
-from coec.calibration.types import Matrix4, Reason
+from coec.calibration.types import NS_PER_S, Matrix4, Reason
 from coec.geometry import linalg
 
 NAMED_AT = 0.95
@@ -65,7 +65,6 @@ EVERY_S = 4.0
 """Least time between two answers to who moved: one takes 0.03 to 0.1 s of a core, and looks come faster than they
 matter."""
 
-NS_PER_S = 1_000_000_000
 BEFORE_ALL_NS = -(2**62)
 """A stamp before any other."""
 

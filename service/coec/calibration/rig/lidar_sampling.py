@@ -13,8 +13,8 @@ from math import radians
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.frames.pairing import MOTION_LATE_NS, MOTION_SAMPLES, NS_PER_S, TimeLine, motion_at
-from coec.calibration.types import EgoMotion, LidarFrame, Matrix4, Reason, SweepTiming
+from coec.calibration.frames.pairing import MOTION_LATE_NS, MOTION_SAMPLES, TimeLine, motion_at
+from coec.calibration.types import NS_PER_S, EgoMotion, LidarFrame, Matrix4, Reason, SweepTiming
 
 KNOWN_BEFORE = np.array([radians(10.0)] * 3 + [1.0] * 3)
 """(6,) standard deviation of a mount before any look (rad, m): at worst, mounts are built to that."""

@@ -22,13 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.rig import attribution
-from coec.calibration.rig.attribution import NS_PER_S, STEPPED2, RigState, SensorHealth, SensorState
+from coec.calibration.rig.attribution import STEPPED2, RigState, SensorHealth, SensorState
 from coec.calibration.rig.edge_observations import MAX_OBSERVATIONS, EdgeObservation, observation_of_window
 from coec.calibration.rig.graph import RigGraph
 from coec.calibration.rig.joint_estimate import JointEstimate, PreMoveKnowledge, estimate_jointly
 from coec.calibration.rig.moved_sensors import Moved, movers
 from coec.calibration.tracker import Measurement
-from coec.calibration.types import Matrix4
+from coec.calibration.types import NS_PER_S, Matrix4
 from coec.geometry import linalg, se3
 
 ALIVE_NS = 60 * NS_PER_S

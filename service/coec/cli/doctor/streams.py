@@ -15,7 +15,7 @@ from typing import get_args
 import numpy as np
 import zenoh
 
-from coec.calibration.types import CameraFrame, Frame, LidarFrame
+from coec.calibration.types import NS_PER_S, CameraFrame, Frame, LidarFrame
 from coec.cli.doctor.environment import cause_of_silence, fail, ok, warn
 from coec.config import CameraMessage, Config, EgoMessage, LidarMessage, PacketMessage, PairConfig
 from coec.errors import DecodeError
@@ -40,8 +40,6 @@ SAMPLES_COUNTED = 200_000
 """Most samples of a stream whose arrival and size are noted: a minute at 3 kHz. A flood beyond that is not counted."""
 
 POLL_S = 0.01
-
-NS_PER_S = 1_000_000_000
 
 OFF_S = 1.0
 """Most time between the stamp of a frame and its arrival: a sweep takes 0.1 s, and its way here as much again."""

@@ -19,7 +19,7 @@ import numpy as np
 import zenoh
 
 from coec.calibration.frames.pairing import Pairer
-from coec.calibration.types import FramePair, Matrix4, Rig
+from coec.calibration.types import NS_PER_S, FramePair, Matrix4, Rig
 from coec.config import Config, LimitsConfig, PairConfig, PairingConfig
 from coec.errors import DecodeError, SourceError
 from coec.geometry import se3
@@ -37,8 +37,6 @@ from coec.schemas.message import from_json, from_msgpack
 from coec.schemas.replies import AxisReply, CalibrationResult, ExtrinsicReply, HealthReply, MetricReply, Transform
 from coec.service.ingest.decoder import CAMERA, EGO, LIDAR, PACKETS_WAITING, Decoder
 from coec.service.ingest.inbox import Inbox, Parcel
-
-NS_PER_S = 1_000_000_000
 
 AGAIN_S = 1.0
 """Time between two lines of the timeline, and between two redraws of the pair for viewers who connected since."""

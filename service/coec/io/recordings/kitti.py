@@ -30,7 +30,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, Matrix4, Recognition, Rig, SweepTiming
+from coec.calibration.types import (
+    NS_PER_S,
+    CameraFrame,
+    EgoMotion,
+    EncodedImage,
+    Matrix4,
+    Recognition,
+    Rig,
+    SweepTiming,
+)
 from coec.config import LimitsConfig, parse_yaml
 from coec.errors import ConfigError, DecodeError, SourceError
 from coec.geometry import cameras, se3
@@ -38,8 +47,6 @@ from coec.io.images import probe
 from coec.io.recordings.cloud_files import XYZI, CloudLayout, load_cloud
 from coec.io.recordings.recording_source import FramewiseRecording, RecordedFrame, SourceSpec
 from coec.io.user_files import read_bytes
-
-NS_PER_S = 1_000_000_000
 
 MAX_TEXT_BYTES = 32 * 2**20
 """Largest text file, bytes. The poses of the longest drive of KITTI-360, 19,240 frames, have 4 MB."""

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.frames.pairing import Pairer
-from coec.calibration.frames.window import NS_PER_S, BetweenPairs
-from coec.calibration.types import MOUNT_RAD, CameraFrame, Frame, FramePair, Matrix4, Recognition, Window
+from coec.calibration.frames.window import BetweenPairs
+from coec.calibration.types import MOUNT_RAD, NS_PER_S, CameraFrame, Frame, FramePair, Matrix4, Recognition, Window
 from coec.config import CalibrationConfig, Config, LimitsConfig, PairingConfig, WindowConfig
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.geometry import se3

@@ -22,14 +22,12 @@ from coec.io.images import BYTES_PER_PIXEL
 from coec.io.ros import messages, point_clouds
 from coec.schemas import replies
 from coec.schemas.keys import sensor_status_name, status_name
-from coec.schemas.replies import ROS_LEVELS, CalibrationResult, HealthReply, MetricReply
+from coec.schemas.replies import AXES, ROS_LEVELS, UNITS, CalibrationResult, HealthReply, MetricReply
 from coec.schemas.rig_state import SensorReply, SensorState
 
 ServicePhase = Literal["starting", "running", "stopping", "failing"]
 """State of the whole service, as in `status`."""
 
-UNITS: Final = ("deg", "deg", "deg", "m", "m", "m")
-AXES: Final = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 MAX_MESSAGE: Final = 500
 """Most characters of the sentence, which panels show in one line; the values hold every reason in full."""

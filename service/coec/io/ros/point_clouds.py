@@ -31,7 +31,7 @@ from rosbags.typesys.stores.ros2_humble import sensor_msgs__msg__PointCloud2 as 
 from rosbags.typesys.stores.ros2_humble import sensor_msgs__msg__PointField as PointField
 from rosbags.typesys.stores.ros2_humble import std_msgs__msg__Header as Header
 
-from coec.calibration.types import LidarFrame, Recognition
+from coec.calibration.types import NS_PER_S, LidarFrame, Recognition
 from coec.config import LimitsConfig, PointTimeConfig, TimeBase, TimeUnit
 from coec.errors import DecodeError
 from coec.io.frame_validation import MAX_FRAME_ID, Refusal, finite_rows, lidar_frame
@@ -94,8 +94,6 @@ one of them."""
 
 FINEST_S: Final = 1e-3
 """Largest step between neighbouring values of a time of day that can date a sweep; float32 is coarser."""
-
-NS_PER_S: Final = 1_000_000_000
 
 _TICKS: Final[dict[TimeUnit, int]] = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": NS_PER_S}
 """Ticks of each unit in a second."""

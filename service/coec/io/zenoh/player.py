@@ -15,7 +15,7 @@ from typing import Final, Literal, Protocol, TypeVar
 import zenoh
 from pydantic import TypeAdapter, ValidationError
 
-from coec.calibration.types import CameraFrame, EgoMotion, Frame, LidarFrame
+from coec.calibration.types import NS_PER_S, CameraFrame, EgoMotion, Frame, LidarFrame
 from coec.config import OpenPairConfig, TopicName
 from coec.errors import UsageError
 from coec.io import msgpack_frames
@@ -23,8 +23,6 @@ from coec.io.ros import message_encoding, messages
 from coec.io.ros.topics import TopicMessage, qos_of
 from coec.io.ros.wire_format import Dialect, Node, RmwZenoh, Ros2dds
 from coec.io.zenoh.ros_node import RosNode, RosPublisher, RosPublishers, has_subscribers
-
-NS_PER_S = 1_000_000_000
 
 
 class Stamped(Protocol):

@@ -9,12 +9,11 @@ from dataclasses import dataclass
 
 from coec.calibration.monitor.change_detector import ACQUITTAL_PERIODS
 from coec.calibration.state import NOT_ACQUITTED
-from coec.calibration.types import Reason
+from coec.calibration.types import NS_PER_S, Reason
 from coec.errors import ModelError
 from coec.service.engine.frame_selector import RESULT_PERIODS
 from coec.service.ingest.decoder import CAMERA, LIDAR
 from coec.service.ingest.pair_stream import StreamStatistics
-from coec.service.timing import NS_PER_S
 from coec.service.worker import compilation
 from coec.service.worker.job_queue import BUSY, SUPERSEDED, WORKER_FAILED
 from coec.service.worker.worker_jobs import Fate

@@ -9,7 +9,7 @@ import logging
 from collections import deque
 
 from coec.calibration.frames import window
-from coec.calibration.types import FramePair, Rig
+from coec.calibration.types import NS_PER_S, FramePair, Rig
 from coec.config import MAX_SLICE_S, LimitsConfig, PairConfig
 from coec.io.depth.depth_maps import STEREO
 from coec.io.images import CompressingReducer, Inspector
@@ -21,7 +21,6 @@ from coec.service.ingest.pair_stream import SelectionStatistics
 from coec.service.recording.recorder import RecordBetween, RecordPair
 from coec.service.recording.window_store import start_ns_of
 from coec.service.records.pair_store import ServedExtrinsic
-from coec.service.timing import NS_PER_S
 from coec.service.worker.worker_jobs import DEADLINE_S, Kind
 
 _log = logging.getLogger(__name__)

@@ -18,7 +18,7 @@ from coec.calibration.rig import lidar_sampling
 from coec.calibration.rig.edge_observations import determined_covariance, observation_of_registration, window_of
 from coec.calibration.rig.graph import Edge
 from coec.calibration.rig.rig_estimator import EdgeWindow
-from coec.calibration.types import EgoMotion, Frame, LidarFrame, Matrix4, Reason, Rig
+from coec.calibration.types import NS_PER_S, EgoMotion, Frame, LidarFrame, Matrix4, Reason, Rig
 from coec.config import LidarEdgesConfig, PairConfig
 from coec.io import nearest_neighbours
 from coec.io.rig_files import rig_of
@@ -34,7 +34,6 @@ from coec.service.engine.rig import (
 from coec.service.engine.schedule import Request, Schedule
 from coec.service.engine.vehicle import Vehicle
 from coec.service.ingest.decoder import EGO, LIDAR, SensorStream, Taker
-from coec.service.timing import NS_PER_S
 from coec.service.worker import worker_jobs
 from coec.service.worker.supervisor import Worker
 

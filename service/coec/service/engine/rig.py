@@ -29,13 +29,12 @@ from coec.calibration.rig.lidar_sampling import KNOWN_BEFORE, RangeBias
 from coec.calibration.rig.rig_estimator import EdgeWindow, JointPose, ServedEdge, VehicleRig, pairs_of
 from coec.calibration.state import PairState
 from coec.calibration.tracker import Measurement, prior_sigma
-from coec.calibration.types import Estimate, Matrix4, Reason
+from coec.calibration.types import NS_PER_S, Estimate, Matrix4, Reason
 from coec.config import LinkConfig, PairConfig
 from coec.io.disk_writer import DiskWriter
 from coec.service.engine.schedule import NEVER_NS, ReportSchedule
 from coec.service.recording.window_store import start_ns_of
 from coec.service.records.rig_store import RigStore
-from coec.service.timing import NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)

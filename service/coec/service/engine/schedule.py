@@ -21,7 +21,7 @@ from collections import Counter, deque
 from dataclasses import dataclass, field, replace
 from typing import Generic, TypeVar
 
-from coec.service.timing import NS_PER_S
+from coec.calibration.types import NS_PER_S
 
 Subject = TypeVar("Subject")
 Result = TypeVar("Result")

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from coec.calibration.frames import lidar_origin
-from coec.calibration.types import CameraFrame, EgoMotion, Frame, LidarFrame
+from coec.calibration.types import NS_PER_S, CameraFrame, EgoMotion, Frame, LidarFrame
 from coec.config import (
     IDENTITY,
     AnyStreamConfig,
@@ -43,7 +43,7 @@ from coec.io.ros.packet_streams import PacketAssembler, PacketSensor
 from coec.io.ros.transforms import MovingFrame
 from coec.io.ros.wire_format import MessageAttachment
 from coec.io.zenoh.bus import CDR, InputSample
-from coec.service.timing import NS_PER_S, QUICK_S, Histogram
+from coec.service.timing import QUICK_S, Histogram
 
 MAX_GAP = 100_000
 """A larger step means that the sender counts anew: at 100 Hz this gap would be a quarter of an hour of loss."""

@@ -11,11 +11,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from coec.calibration.frames.pairing import Pairer
-from coec.calibration.types import CameraFrame, EgoMotion, Frame, FramePair, ImageQuality, LidarFrame, Matrix4
+from coec.calibration.types import NS_PER_S, CameraFrame, EgoMotion, Frame, FramePair, ImageQuality, LidarFrame, Matrix4
 from coec.config import PairConfig, SnippetsConfig
 from coec.io.logs import LossCounter
 from coec.service.ingest.decoder import LIDAR, SensorStream, StreamCounts
-from coec.service.timing import NS_PER_S, QUICK_S, Histogram, SensorClock
+from coec.service.timing import QUICK_S, Histogram, SensorClock
 
 # --- frames in memory -------------------------------------------------------------------------------------------------
 

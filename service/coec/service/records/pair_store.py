@@ -17,7 +17,7 @@ import numpy as np
 from coec.calibration.frames.window import CarriedOverPairs
 from coec.calibration.state import PairState, Provenance, aged, carried_over_pairs, initial_state, overdue, restored
 from coec.calibration.state_machine import HealthState
-from coec.calibration.types import Matrix4, Reason, Rig
+from coec.calibration.types import NS_PER_S, Matrix4, Reason, Rig
 from coec.config import StateConfig
 from coec.errors import NotFoundError, StateError
 from coec.io.disk_writer import DiskWriter
@@ -28,7 +28,7 @@ from coec.service.recording.window_store import WindowStore, WindowVersion
 from coec.service.records.history import GENESIS, CheckLog, HistoryRecord, PairHistory
 from coec.service.records.incidents import Incidents, Side
 from coec.service.records.state_store import Clocks, LostPart, StateStore
-from coec.service.timing import NS_PER_S, Clock
+from coec.service.timing import Clock
 
 _log = logging.getLogger(__name__)
 
