@@ -231,9 +231,7 @@ def parse_yaml(text: str) -> Any:
         raise ConfigError(_error_with_position(error)) from error
     except YAMLError as error:
         raise ConfigError(" ".join(str(error).split())) from error
-    except (
-        Exception
-    ) as error:  # constructors of numbers, dates and the like raise any exception that Python's own raise
+    except Exception as error:  # constructors of numbers, dates and the like raise whatever Python's own raise
         raise ConfigError(f"a value in it is invalid: {type(error).__name__}") from error
     _check_extent(document)
     return document
@@ -320,14 +318,9 @@ def _resolve_paths(config: Config, folder: Path) -> Config:
     zenoh = config.zenoh
     if zenoh.file is not None:
         zenoh = zenoh.model_copy(update={"file": folder / zenoh.file})
-    authority_paths = config.authority
-    files = {
-        "certificate": authority_paths.certificate,
-        "private_key": authority_paths.private_key,
-        "root_ca": authority_paths.root_ca,
-    }
-    authority = authority_paths.model_copy(
-        update={name: None if path is None else folder / path for name, path in files.items()}
+    files = {name: getattr(config.authority, name) for name in ("certificate", "private_key", "root_ca")}
+    authority = config.authority.model_copy(
+        update={name: folder / path for name, path in files.items() if path is not None}
     )
     state = config.state.model_copy(update={"directory": folder / config.state.directory})
     pairs = tuple(_resolve_pair_paths(pair, folder) for pair in config.pairs)

@@ -93,11 +93,11 @@ class _Processes:
         self._bounds = bounds
 
     def start(self) -> worker_pool.PoolWorker:
-        """See `Workers`."""
+        """See `WorkerFactory`."""
         return _Process(self._settings)
 
     def events(self, workers: Sequence[worker_pool.PoolWorker], timeout_s: float) -> Iterator[worker_pool.WorkerEvent]:
-        """See `Workers`."""
+        """See `WorkerFactory`."""
         processes = cast("Sequence[_Process]", workers)
         for process in processes:
             held = process.resident_bytes if process.ready else 0
@@ -243,11 +243,11 @@ class _Actors:
         }
 
     def start(self) -> worker_pool.PoolWorker:
-        """See `Workers`."""
+        """See `WorkerFactory`."""
         return _Actor(self._ray.remote(_Judge).options(**self._options).remote(*self._arguments), self._ray)
 
     def events(self, workers: Sequence[worker_pool.PoolWorker], timeout_s: float) -> Iterator[worker_pool.WorkerEvent]:
-        """See `Workers`."""
+        """See `WorkerFactory`."""
         actors = cast("Sequence[_Actor]", workers)
         pending = [one for actor in actors for one in actor.pending]
         done: list[Any] = []

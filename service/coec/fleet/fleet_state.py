@@ -57,7 +57,7 @@ class FleetFilter:
     text: str = ""
 
     def passes(self, name: PairName, state: str) -> bool:
-        """Whether a pair that is shown in state `told` passes."""
+        """Whether a pair that is shown in this state passes."""
         return (not self.states or state in self.states) and (not self.text or self.text in f"{name[0]}/{name[1]}")
 
 

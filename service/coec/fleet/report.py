@@ -252,7 +252,7 @@ def columns(folder: Path) -> list[tuple[str, str]]:
     """Name and type of every column.
 
     Raises:
-        UsageError, SourceError: as `ask`.
+        UsageError, SourceError: as `connect`.
     """
     described = connect(folder).execute(f"DESCRIBE {WINDOWS_VIEW}").fetchall()
     return [(str(name), str(kind)) for name, kind, *_ in described]
@@ -315,8 +315,8 @@ _ACCEPTED = f"(SELECT vehicle, pair, date, stamp_ns, {_OBSERVED_CORRECTIONS} FRO
 
 
 def report(folder: Path, against: Path | None, fleet_now: documents.FleetNow | None = None) -> documents.FleetReport:
-    """The report from the tables in a folder. `against`: folder of an earlier batch over the same windows. `now`: the
-    last words of the vehicles, for their alarms.
+    """The report from the tables in a folder. `against`: folder of an earlier batch over the same windows. `fleet_now`:
+    the last words of the vehicles, for their alarms.
 
     Raises:
         UsageError: there are no tables.

@@ -449,7 +449,7 @@ def _checked(image: EncodedImage, limits: LimitsConfig) -> EncodedImage:
 
 
 class GreyImages:
-    """Implements `ports.ImageReader`."""
+    """Implements `ImageReader`."""
 
     def __init__(self, limits: LimitsConfig) -> None:
         self._limits = limits
@@ -464,7 +464,7 @@ class GreyImages:
 
 
 class CompressingReducer:
-    """Implements `ports.ImageReducer`. Compressed images stay as they are. Raw pixels become a grey JPEG with a tenth
+    """Implements `ImageReducer`. Compressed images stay as they are. Raw pixels become a grey JPEG with a tenth
     to a thirtieth of their bytes, which takes 10 ms of a core per megapixel."""
 
     def __init__(self, limits: LimitsConfig) -> None:
@@ -484,7 +484,7 @@ class CompressingReducer:
 
 
 class CachedGreys:
-    """Keeps the grey images of the last frames, for solving one window many times. Implements `ports.ImageReader`."""
+    """Keeps the grey images of the last frames, for solving one window many times. Implements `ImageReader`."""
 
     def __init__(self, reader: GreyImages, entries: int) -> None:
         self._reader = reader
@@ -506,7 +506,7 @@ class CachedGreys:
 
 
 class Inspector:
-    """Implements `ports.ImageInspector`.
+    """Implements `ImageInspector`.
 
     Sharpness is the mean squared difference between neighbours, over both directions, divided by twice the variance of
     the grey values, on the image at half size: 0 for a uniform image, 1 for white noise. It does not change with

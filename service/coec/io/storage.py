@@ -343,7 +343,8 @@ class AppendLog(Generic[T]):
         self._on_disk: tuple[T, ...] = ()
 
     def load(self) -> list[bytes]:
-        """The complete lines of the file; see `Log.load`. Call this and `found` before several threads use the ledger.
+        """The complete lines of the file; see `LineLog.load`. Call this and `restored` before several threads use the
+        ledger.
 
         Raises:
             OSError: the file exists but cannot be read; it will be rewritten.

@@ -279,7 +279,7 @@ def picture_of(
     *,
     compensated: bool,
 ) -> PairPicture:
-    """The picture of a pair, with the parts for the topics in `wanted`.
+    """The picture of a pair, with the parts for the topics in `requested`.
 
     Raises:
         DecodeError: viewers cannot hold the stamp, or the raw pixels do not have the size that they claim.

@@ -73,7 +73,7 @@ class Series:
 
 @dataclass(frozen=True, slots=True)
 class Ground:
-    """A state that holds from one x to another, shown as the background colour; `tone` as in `blocks.Tone`."""
+    """A state that holds from one x to another, shown as the background colour; `tone` as in `page.Tone`."""
 
     begin: float
     end: float
@@ -343,7 +343,7 @@ class DotKind:
     """What a dot stands for.
 
     Attributes:
-        tone: its colour, as in `blocks.Tone`.
+        tone: its colour, as in `page.Tone`.
         shape: its shape, which tells kinds apart without colour.
         full: whether it is filled or hollow.
     """
@@ -356,7 +356,8 @@ class DotKind:
 
 @dataclass(frozen=True, slots=True)
 class Dot:
-    """A dot right of and above the centre, as shares of the radius; `told` is shown when a reader points at it."""
+    """A dot right of and above the centre, as shares of the radius; `description` is shown when a reader points at
+    it."""
 
     right: float
     up: float

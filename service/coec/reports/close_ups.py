@@ -369,7 +369,7 @@ def shift_px(window: Window, T_one: Matrix4, T_other: Matrix4, *, compensated: b
 
 
 def evenly(count: int, at_most: int) -> list[int]:
-    """At most `wanted` of `count` indices, each in the middle of its share."""
+    """At most `at_most` of `count` indices, each in the middle of its share."""
     return [int((2 * k + 1) * count / (2 * min(at_most, count))) for k in range(min(at_most, count))]
 
 

@@ -174,7 +174,8 @@ class StageTimes:
         self._elapsed_s: dict[str, float] = {}
 
     def step(self, stage: str, done: int, total: int) -> None:
-        """See `ports.Progress`. A search has no total: its number of evaluations is unknown until it ends."""
+        """See `calibration.types.Progress`. A search has no total: its number of evaluations is unknown until it
+        ends."""
         now_s = time.perf_counter()
         self._elapsed_s[stage] = self._elapsed_s.get(stage, 0.0) + now_s - self._mark_s
         self._mark_s = now_s

@@ -18,7 +18,7 @@ KEYS = "↑↓ choose   r reasons   h history   o overlay   f filter   q quit"
 
 
 def board(fleet: FleetNow, selected: int, first: int, rows: int, filtered: str) -> RenderableType:
-    """The head, and `rows` of the pairs from `first` on; the one at `chosen` is marked (-1: none)."""
+    """The head, and `rows` of the pairs from `first` on; the one at `selected` is marked (-1: none)."""
     shown = fleet.pairs[first : first + rows]
     table = console.table(
         "", "vehicle", "pair", "state", "said", "checked", "drift", "± σ", "why", "event", right=(4, 5, 6, 7)

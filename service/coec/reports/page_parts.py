@@ -120,7 +120,7 @@ def axes_table(
     labels: Mapping[int, str] | None = None,
     more: Mapping[str, Sequence[str]] | None = None,
 ) -> page.AxesTable:
-    """A table of six axes, deg and m. `words` replace the values of axes that have none; `more` are further columns by
+    """A table of six axes, deg and m. `labels` replace the values of axes that have none; `more` are further columns by
     head."""
     labels, more = labels or {}, more or {}
     widest = {

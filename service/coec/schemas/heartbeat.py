@@ -1,7 +1,7 @@
 """The heartbeat of a pair: what a fleet centre needs to know about it, in a kilobyte.
 
 The service publishes it on change and periodically. A Zenoh storage keeps it, so that it can be queried while the
-vehicle is parked. `read` decodes a word that came over a network, within bounds.
+vehicle is parked. `decode_heartbeat` decodes a word that came over a network, within bounds.
 """
 
 from typing import Final, Literal

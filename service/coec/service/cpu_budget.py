@@ -421,8 +421,8 @@ class Budget:
             scheduler.join_checks(name, period_s)
 
     def try_acquire(self, pair: str, stamp_ns: int, *, suspected: bool) -> bool:
-        """Whether a check of a pair may begin now that its stream has come to this stamp. If so, call `ended` after
-        it."""
+        """Whether a check of a pair may begin now that its stream has come to this stamp. If so, call `release`
+        after it."""
         with self._scheduling() as scheduler:
             return scheduler.try_acquire(pair, stamp_ns, suspected=suspected)
 

@@ -417,7 +417,7 @@ class StoredNominal(Part):
 
 
 class StoredDiscovery(Part):
-    """`Found` on the disk. `asked` is the hash of what the configuration left out and where it was looked for.
+    """`DiscoveredPair` on the disk. `asked` is the hash of what the configuration left out and where it was looked for.
     `found_ns` is the wall clock when it was found."""
 
     asked: str

@@ -100,7 +100,7 @@ class _PendingPair:
 
 
 class DiscoveryListener:
-    """Listens for the awaited pairs of a vehicle. `take_*` are for the network's threads, `look` for this thread, all
+    """Listens for the awaited pairs of a vehicle. `take_*` are for the network's threads, `update` for this thread, all
     else for any."""
 
     def __init__(self, config: Config, earlier: Mapping[str, DiscoveredPair]) -> None:

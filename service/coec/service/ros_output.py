@@ -170,7 +170,7 @@ PICTURES_QOS: Final = Qos(depth=1)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _RosCamera:
-    """A camera in a form that ROS has words for, as a rig; None if ROS has none. `word` explains it to people."""
+    """A camera in a form that ROS has words for, as a rig; None if ROS has none. `text` explains it to people."""
 
     source: Rig
     rig: Rig | None

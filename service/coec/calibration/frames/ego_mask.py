@@ -208,7 +208,7 @@ def _grown(cells: Cells) -> Cells:
 
 def _least_around(values: NDArray[Value], border: int | bool) -> NDArray[Value]:
     """The least value of each cell and its eight neighbours, along one axis after the other; beyond the border the
-    value is `outside`."""
+    value is `border`."""
     padded = np.pad(values, 1, constant_values=border)
     columns = np.minimum(np.minimum(padded[:, :-2], padded[:, 1:-1]), padded[:, 2:])
     return np.asarray(np.minimum(np.minimum(columns[:-2], columns[1:-1]), columns[2:]))

@@ -1,8 +1,8 @@
 """What several pairs of one vehicle together say about each of its sensors, look after look.
 
 A knocked LiDAR moves the edges to all its cameras alike; a knocked camera moves only its own. Every few seconds the
-question which sensors moved since the rig was last consistent is asked again (`moves`), about steps at several times in
-the past (`steps`).
+question which sensors moved since the rig was last consistent is asked again (`who_moved`), about steps at several
+times in the past (`steps_at`).
 
 A sensor is named (reported as moved) by two answers in a row, each of which knows of a new look at the sensor, and by
 looks at two of its pairs if it has as many. A run of bad looks at one pair, or one pair that was looked at before the
@@ -59,7 +59,7 @@ STEPPED2 = chi2_quantile(0.999, 6)
 
 POOREST = 3.0
 """A poor street displaces all observations by up to so many standard deviations of usual streets
-(`monitor.dispersion`). See docs/measured.md."""
+(`dispersion`). See docs/measured.md."""
 
 EVERY_S = 4.0
 """Least time between two answers to who moved: one takes 0.03 to 0.1 s of a core, and looks come faster than they

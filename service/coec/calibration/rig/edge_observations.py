@@ -6,7 +6,7 @@ An accepted window tells a step by itself if what was served rests on windows, t
 estimator, which cancels, while the bias of checks is another and may be larger than a step.
 
 Of the looks, each side is a robust mean. A good look is Student-distributed about the place of the edge; a bad look
-lies anywhere within reach. This is the model of `monitor.likelihood`, in all six axes at once. The mean is the mode of
+lies anywhere within reach. This is the model of `sequential_tests`, in all six axes at once. The mean is the mode of
 that mixture, found by expectation maximisation from several looks; the likeliest end is taken.
 """
 
@@ -116,7 +116,7 @@ def observation_of_check(
     edge: str, T_served: Matrix4, observation: Observation, share: float = 1.0, stepped_ns: int | None = None
 ) -> EdgeObservation | None:
     """The look that a check of the pose `T_served` (4, 4) is; None if the check says nothing of the mount, because the
-    data were at fault, it holds no new frame, or it determines no axis. For `stepped_ns` see `Look`.
+    data were at fault, it holds no new frame, or it determines no axis. For `stepped_ns` see `EdgeObservation`.
 
     Raises:
         ValueError: the pose is not rigid, or the offset is not six numbers.
@@ -191,7 +191,7 @@ REACH = np.array([*ROTATIONS.reach, *TRANSLATIONS.reach])
 """(6,) standard deviation of the offsets of bad looks (rad, m)."""
 
 MOST_WINDOWS = 4
-"""Most windows of an edge that are kept: three may be urgent in one suspicion (`monitor.urgency`)."""
+"""Most windows of an edge that are kept: three may be urgent in one suspicion (`urgent_window_since`)."""
 
 STARTS, TURNS = 3, 5
 """Looks from which a mean is sought, and rounds of the search: the means of drawn looks stand still after four."""

@@ -334,7 +334,7 @@ class JointEstimate:
         T_a_b: (4, 4) of each edge of the graph, measured or not, by name.
         covariance: (6·E, 6·E) of the perturbations of all edges about the axes of their first sensors, in the order of
             `T_a_b`, including the covariances between edges. An edge that nothing measured is as wide as
-            `system.BUILT`.
+            `BUILT`.
         measured: edges that a window measured.
         chi2, freedom, chance: how well all windows fit each other: the sum of squares, its degrees of freedom (0 if no
             loop closes), and the chance of a sum as large.

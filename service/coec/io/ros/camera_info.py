@@ -261,7 +261,7 @@ def intrinsics_of_info(info: CameraInfoContent, *, rectified: bool) -> CameraInf
     (u + 0.5)/b - 0.5.
 
     A message with a rectifying rotation `R` does not say whether its frame is that of the raw or of the rectified
-    image. It is taken for the frame of the image in question, and `told` gives the angle.
+    image. It is taken for the frame of the image in question, and `source` gives the angle.
 
     Raises:
         SourceError: uncalibrated, an unknown model, numbers that no lens has, or the second image of a stereo camera,

@@ -147,13 +147,13 @@ class Commands(_CountedCommands):
 
     def reserve_for(self, proven: Iterable[str]) -> None:
         """Reserves a rate for each sender who can prove his name, so that others cannot use it up. The names are those
-        of `payloads.proven_sender`."""
+        of `proven_sender`."""
         self._rate.reserve_for(proven)
 
     def carry_out(
         self, name: str, arguments: dict[str, Any], sender: str, deadline_s: float = math.inf
     ) -> Acknowledgement:
-        """Carries out a command of `payloads.NAMES`, or says why not. A command that is not begun by the deadline
+        """Carries out a command of `COMMAND_NAMES`, or says why not. A command that is not begun by the deadline
         (steady clock), at which its sender gives up, is not carried out."""
         command = PairCommand(
             name,

@@ -23,7 +23,7 @@ ServiceState = Literal["starting", "running", "stopping", "failing"]
 
 
 class Heartbeats:
-    """The last words of one vehicle. `renew` and `use` are for the main thread, `answer` for any."""
+    """The last words of one vehicle. `renew` and `reconfigure` are for the main thread, `answer` for any."""
 
     def __init__(
         self,

@@ -1,8 +1,9 @@
 """One camera-LiDAR pair as a state machine: events in, actions out.
 
 `step` takes one event after the other: the streams have come to a sensor time, a frame pair, the outcome of a job, the
-passing of time, another configuration. It returns what is to be done outside, as values (`messages`). `execute` does
-the same for a command of a person. Nothing here waits or has a thread, and the clocks are given by the caller.
+passing of time, another configuration. It returns what is to be done outside, as values (`messages`). `execute` of
+`commands` does the same for a command of a person. Nothing here waits or has a thread, and the clocks are given by the
+caller.
 
 What a job changes takes effect in two steps (`schedule`). Its outcome is concluded as soon as it and those of all
 earlier requests have come: that changes the state and what is served. What that changes in the selection of frames is

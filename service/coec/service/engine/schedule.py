@@ -200,7 +200,7 @@ class ReportSchedule(Generic[T]):
         self._advance()
 
     def take(self, *, all_are_silent: bool) -> Report[T] | None:
-        """Takes out the next report; `took` has to follow. None while an earlier report may still come. Once the
+        """Takes out the next report; `finish` has to follow. None while an earlier report may still come. Once the
         streams of all pairs have stopped, nothing is waited for."""
         if not self._waiting or not (all_are_silent or self._waiting[0].due_ns <= self._passed_ns()):
             return None

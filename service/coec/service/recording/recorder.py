@@ -333,7 +333,8 @@ class Recorder:
         self._put(configuration)
 
     def follow(self, plan: RecordingPlan) -> None:
-        """Records the next window by this plan. Its configuration of the calibration is ignored; `use` sets that."""
+        """Records the next window by this plan. Its configuration of the calibration is ignored; `reconfigure` sets
+        that."""
         self._plan = plan
 
     def add(self, item: RecordPair | RecordBetween) -> None:

@@ -222,7 +222,8 @@ class _OpenSnippet:
 
 
 class SnippetRecorder:
-    """Records the snippets of one pair, one at a time. `give` is for any thread, everything else for the recorder's."""
+    """Records the snippets of one pair, one at a time. `submit` is for any thread, everything else for the
+    recorder's."""
 
     def __init__(
         self, rig: Rig, metadata: Mapping[str, str], store: SnippetStore, losses: LossCounter, *, packed: bool

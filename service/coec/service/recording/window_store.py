@@ -392,7 +392,7 @@ class WindowStore:
                     return False
                 del self._files[window_id]
                 self._views.clear()
-            self._changed_ns = None  # if it cannot be removed, the next `look` finds it again
+            self._changed_ns = None  # if it cannot be removed, the next `scan` finds it again
             self.path(window_id).unlink(missing_ok=True)
             self.removed += 1
             return True
