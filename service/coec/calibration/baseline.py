@@ -79,17 +79,14 @@ class PaperFigures(Protocol):
     @property
     def mi(self) -> float:
         """Equation (1), nats."""
-        ...
 
     @property
     def f1(self) -> float:
         """Largest slope of the rotations, nats per radian."""
-        ...
 
     @property
     def f2(self) -> float:
         """Least peakedness of the rotations, nats per radian²."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -604,7 +604,6 @@ class DepthModel(Protocol):
     @property
     def identity(self) -> str:
         """sha256 of the network file in hexadecimal, or `precomputed`: part of every decision's hash."""
-        ...
 
     def infer(self, frame: CameraFrame) -> DepthMap:
         """Depth of the frame, at the resolution of the network.
@@ -612,7 +611,6 @@ class DepthModel(Protocol):
         Raises:
             DecodeError: the image or the precomputed map cannot be decoded, or there is no map.
         """
-        ...
 
 
 class ImageReader(Protocol):
@@ -624,7 +622,6 @@ class ImageReader(Protocol):
         Raises:
             DecodeError: the image cannot be decoded within the limits.
         """
-        ...
 
 
 class ImageInspector(Protocol):
@@ -636,7 +633,6 @@ class ImageInspector(Protocol):
         Raises:
             DecodeError: the image cannot be decoded within the limits.
         """
-        ...
 
 
 class ImageReducer(Protocol):
@@ -648,7 +644,6 @@ class ImageReducer(Protocol):
         Raises:
             DecodeError: the image cannot be decoded within the limits.
         """
-        ...
 
 
 class Progress(Protocol):
@@ -656,7 +651,6 @@ class Progress(Protocol):
 
     def step(self, stage: str, done: int, total: int) -> None:
         """`done` of `total` parts of the stage are complete."""
-        ...
 
 
 class Silence:
@@ -696,7 +690,6 @@ class Neighbourhood(Protocol):
     def nearest(self, queries_m: NDArray[np.float64], count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Indices (N, count) of the nearest points of each query (N, 3), nearest first, and squared distances
         (N, count) in m². The set must hold at least `count` points. Every call gives the same to the bit."""
-        ...
 
 
 class NeighbourSearch(Protocol):
@@ -704,4 +697,3 @@ class NeighbourSearch(Protocol):
 
     def over(self, points_m: NDArray[np.float64]) -> Neighbourhood:
         """The neighbourhood over finite points (M, 3)."""
-        ...

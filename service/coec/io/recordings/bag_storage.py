@@ -81,7 +81,6 @@ class BagStorage(Protocol):
     @property
     def path(self) -> Path:
         """See above."""
-        ...
 
     def entries(self) -> Iterator[BagMessage]:
         """All CDR messages, in the order in which they lie in the bag; also those that are damaged.
@@ -89,11 +88,9 @@ class BagStorage(Protocol):
         Raises:
             SourceError: a file is absent, cut off, or so damaged that what follows cannot be read; names it.
         """
-        ...
 
     def open(self) -> AbstractContextManager[BagReader]:
         """A context manager that gives a reader; the files are closed at its end."""
-        ...
 
 
 _NO_CHUNK = -1

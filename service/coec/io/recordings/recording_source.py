@@ -107,37 +107,30 @@ class RecordingSource(Protocol):
     @property
     def name(self) -> str:
         """Layout, drive and camera, for people to read."""
-        ...
 
     @property
     def rig(self) -> Rig:
         """Rig of the pair, with the calibration that came with the recording as nominal."""
-        ...
 
     @property
     def T_camera_lidar_start(self) -> Matrix4:
         """(4, 4) extrinsic that was current when the recording was made; the nominal one if that was not recorded."""
-        ...
 
     @property
     def configuration(self) -> CalibrationConfig | None:
         """Configuration that a recorded window carries; None for every other recording."""
-        ...
 
     @property
     def camera_stamps_ns(self) -> tuple[int, ...]:
         """Stamps of the camera frames, ascending, nanoseconds."""
-        ...
 
     @property
     def sweep_stamps_ns(self) -> tuple[int, ...]:
         """Stamps of the sweeps, ascending, nanoseconds."""
-        ...
 
     @property
     def motion_stamps_ns(self) -> tuple[int, ...]:
         """Stamps of the ego-motion, ascending, nanoseconds; empty if there is none."""
-        ...
 
     def messages(self, cameras: Collection[int] | None = None) -> Iterator[Frame]:
         """Messages in ascending order of their stamps, each loaded when it is its turn.
@@ -150,7 +143,6 @@ class RecordingSource(Protocol):
             UsageError: an index is out of range.
             SourceError: a file cannot be read; names it.
         """
-        ...
 
 
 @runtime_checkable
@@ -159,7 +151,6 @@ class HasGroundTruth(Protocol):
 
     def truth(self, stamp_ns: int) -> Matrix4:
         """True T_camera_lidar (4, 4) at a time."""
-        ...
 
 
 @runtime_checkable
@@ -169,12 +160,10 @@ class HasRecognitions(Protocol):
     @property
     def recognitions(self) -> tuple[Recognition, ...]:
         """What was recognised of the recording as a whole; sweeps have their own."""
-        ...
 
     @property
     def damaged(self) -> DamagedFrames:
         """What has been found damaged so far."""
-        ...
 
 
 def recognitions_of(recording: RecordingSource, sweeps: Iterable[LidarFrame]) -> tuple[Recognition, ...]:

@@ -31,7 +31,6 @@ class Stamped(Protocol):
     @property
     def stamp_ns(self) -> int:
         """Nanoseconds, by the clock of the recording."""
-        ...
 
 
 T = TypeVar("T", bound=Stamped)
