@@ -30,6 +30,7 @@ class Part(BaseModel):
 
     model_config = ConfigDict(
         frozen=True,
+        defer_build=True,
         extra="ignore",
         allow_inf_nan=False,
         # A writer writes every field, even those that a reader can do without.
