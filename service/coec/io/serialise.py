@@ -6,6 +6,7 @@ import json
 import math
 import sys
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -35,6 +36,12 @@ def matrix_of(transform: replies.Transform) -> types.Matrix4:
     return np.array(transform.matrix, dtype=np.float64)
 
 
+REMEMBERED = 128
+"""Estimates, and cameras, whose wire form is remembered: the pairs of a vehicle serve and save the same ones again with
+every check."""
+
+
+@lru_cache(REMEMBERED)
 def intrinsics_of(camera: cameras.Camera) -> replies.Intrinsics:
     """The wire form of a camera; its numbers are the same doubles."""
     parameters = cameras.intrinsics_of(camera)
@@ -91,6 +98,7 @@ def _lens_estimate(lens: replies.Lens) -> types.LensEstimate:
     )
 
 
+@lru_cache(REMEMBERED)
 def result_of(estimate: types.Estimate, rig: types.Rig, vehicle: str) -> replies.CalibrationResult:
     """The wire form of an estimate, complete. NaN becomes null, infinity the largest double."""
     optimum, uncertainty = estimate.optimum, estimate.uncertainty

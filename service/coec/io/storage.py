@@ -486,15 +486,13 @@ class StateFile:
         self._current_is_good, self._loaded = True, self._path
 
 
-def _canonical(value: Any) -> bytes:
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
-
-
 def _encode(body: dict[str, Any], version: int = SCHEMA_VERSION) -> bytes:
+    """Canonical JSON of the body in its envelope."""
+    text = json.dumps(body, sort_keys=True, separators=(",", ":"), allow_nan=False)
     # The checksum of later versions covers the version: else one flipped bit would turn version 1 into a later one.
-    covered = body if version == 1 else {"body": body, "schema_version": version}
-    checksum = hashlib.sha256(_canonical(covered)).hexdigest()
-    return _canonical({"body": body, "checksum": checksum, "schema_version": version})
+    covered = text if version == 1 else f'{{"body":{text},"schema_version":{version}}}'
+    checksum = hashlib.sha256(covered.encode()).hexdigest()
+    return f'{{"body":{text},"checksum":"{checksum}","schema_version":{version}}}'.encode()
 
 
 def _read(path: Path) -> bytes:
