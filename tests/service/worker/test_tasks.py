@@ -76,7 +76,7 @@ def test_pairs_that_differ_in_numbers_alone_are_warmed_up_once(monkeypatch: pyte
         warmed.append(type(window.rig.camera))
         raise CalibrationError("an invented window need not lead to a result")
 
-    monkeypatch.setattr(warm_up, "calibrate", calibrated)
+    monkeypatch.setattr(warm_up, "prepare_window_data", calibrated)
     monkeypatch.setattr(warm_up, "diagnose", calibrated)
     one, other = (next(iter(pair_configs([lens]))) for lens in LENSES[:2])
     another = one.model_copy(update={"name": "another", "lidar": LidarConfig(key="another/lidar")})

@@ -21,8 +21,8 @@ import numpy as np
 from coec.calibration import types
 from coec.calibration.monitor.check_verdict import MIN_PAIRS, diagnose
 from coec.calibration.objective.mutual_information import SearchBox
-from coec.calibration.pipeline import calibrate
 from coec.calibration.search.global_search import sample_reach
+from coec.calibration.solver import prepare_window_data, solve
 from coec.config import CalibrationConfig, Config
 from coec.errors import CalibrationError, DecodeError
 from coec.geometry import compilation_events
@@ -94,7 +94,7 @@ def _binned(camera: Camera) -> BinnedFrames:
     )
 
 
-POINTS = 4000
+POINTS = 2000
 DEPTH_PX = (48, 64)
 
 CAMERA_PX = 128
@@ -118,9 +118,10 @@ def warm_up_solve(rig: types.Rig, calibration: CalibrationConfig, images: GreyIm
     for run in reversed(late_kernels(rig.camera)):
         run()
         yield
+    short = _short(calibration)
     with contextlib.suppress(CalibrationError, DecodeError):
-        calibrate(invented_window(rig), _Ramp(), images, _short(calibration), types.Silence())
-    # These two kernels compute the uncertainty of a result, and an invented window need not give a result.
+        solve(prepare_window_data(invented_window(rig), _Ramp(), images, short, types.Silence()), short)
+    # These two kernels compute the uncertainty of a result, which takes long where nothing fits.
     project(rig.camera, np.ones((1, 3)))
     alignment.alignment_of_parts(one_edge(rig.camera), np.zeros(1, np.uint8), 1, np.eye(4)[None])
     yield
