@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cli.conftest import SMALL, Coec
-from coec.calibration.pipeline import calibrate
+from coec import recording
 from coec.calibration.search.without_start import Weighed
 from coec.calibration.types import DepthModel, Estimate
 from coec.config import DepthConfig, LimitsConfig, VerdictConfig
@@ -39,7 +39,8 @@ def test_recovers_the_truth_from_a_perturbed_start(coec: Coec) -> None:
 
 def weighed_at_once(*arguments: Any) -> tuple[Estimate, Weighed]:
     """Stands for a search of all rotations."""
-    return calibrate(*arguments), Weighed(200_000, 40, 9, 3)
+    estimate, _ = recording.calibrated(*arguments)
+    return estimate, Weighed(200_000, 40, 9, 3)
 
 
 @pytest.mark.parametrize("searches", [False, pytest.param(True, marks=pytest.mark.slow)])
