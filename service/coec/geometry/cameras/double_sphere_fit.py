@@ -137,9 +137,10 @@ class _Problem(NamedTuple):
         m, valid = project(normalised, self.rays)
         if np.count_nonzero(valid) < _PARAMETERS:  # xi near -1 sees next to nothing: all rays count as wrong
             return m, np.zeros((2, 2))
-        mean_m, mean_uv = m[valid].mean(axis=0), self.uv_px[valid].mean(axis=0)
-        centred = m[valid] - mean_m
-        focal = (centred * (self.uv_px[valid] - mean_uv)).sum(axis=0) / (centred**2).sum(axis=0)
+        seen_m, seen_uv = (m, self.uv_px) if valid.all() else (m[valid], self.uv_px[valid])
+        mean_m, mean_uv = seen_m.mean(axis=0), seen_uv.mean(axis=0)
+        centred = seen_m - mean_m
+        focal = (centred * (seen_uv - mean_uv)).sum(axis=0) / (centred**2).sum(axis=0)
         return m, np.stack([focal, mean_uv - focal * mean_m], axis=1)
 
     def residuals(self, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
