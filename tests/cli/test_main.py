@@ -53,6 +53,18 @@ def test_help_of_all_commands_imports_nothing_heavy() -> None:
     assert done.stderr.strip() == "[]"
 
 
+def test_a_query_imports_no_numpy() -> None:
+    """It would take a quarter of the time of a query."""
+    code = (
+        "import sys, coec.cli.query, coec.io.zenoh.query_client\n"
+        "print([name for name in ('numpy', 'numba') if name in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env={"PYTHONPATH": ":".join(sys.path)}
+    )
+    assert (done.stdout.strip(), done.stderr) == ("[]", "")
+
+
 def test_a_source_that_is_refused_is_refused_before_what_draws_is_imported(tmp_path: Path) -> None:
     code = (
         f"import sys; sys.argv = ['coec', 'calibrate', {str(tmp_path / 'absent')!r}]\n"

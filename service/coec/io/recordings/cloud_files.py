@@ -24,9 +24,10 @@ from coec.config import PointTimeConfig
 from coec.errors import DecodeError, MisreadError, SourceError
 from coec.geometry.points import lengths
 from coec.io.frame_validation import Refusal, finite_rows
+from coec.io.numpy_files import read_npy, read_npz
 from coec.io.recordings.cloud_formats import MAX_POINTS, TableError, columns_of_las, parse_pcd, parse_ply, viewpoint_of
 from coec.io.ros.point_clouds import FIELDS, REFLECTANCE_FIELDS, offsets_s, time_field
-from coec.io.user_files import read_bytes, read_npy, read_npz
+from coec.io.user_files import read_bytes
 
 Columns = Mapping[str, NDArray[Any]]
 """`x`, `y` and `z`, and if the file has them `intensity`, `ring` and times, each (N,). Not filtered."""

@@ -34,11 +34,12 @@ from coec.geometry import cameras, se3
 from coec.geometry.cameras import Camera
 from coec.io.images import encode_depth_png, probe, raw_image
 from coec.io.intrinsics_files import cameras_of, load_camera_document, with_camera
+from coec.io.numpy_files import read_npy
 from coec.io.recordings import bag_recognition, recording_source
 from coec.io.recordings.cloud_files import MAX_COLUMNS, CloudLayout, load_cloud, measured_from
 from coec.io.recordings.kitti import load_image
 from coec.io.rig_files import camera_of, load_mask
-from coec.io.user_files import read_bytes, read_npy, write_output
+from coec.io.user_files import read_bytes, write_output
 
 FILE_NAME = "dataset.yaml"
 CAMERA_FRAME = "camera"
