@@ -41,6 +41,10 @@ LENS_SIGMA = 1.0, VerdictConfig().focal_length_sigma
 ALL_HELD = (3, 4, 5)
 
 
+def posterior_at(assumed: Assumptions, pose: Matrix4) -> Posterior | None:
+    return measure_posterior(assumed, assumed.levels_at(pose))
+
+
 def measured(
     levels: list[EdgeFrames],
     motions: list[EgoMotion],
@@ -48,7 +52,7 @@ def measured(
     held: Sequence[int] = (),
     known_m: float = KNOWN_M,
 ) -> Posterior:
-    result = measure_posterior(Assumptions(levels, corner_window(motions), held, known_m, LENS_SIGMA), pose)
+    result = posterior_at(Assumptions(levels, corner_window(motions), held, known_m, LENS_SIGMA), pose)
     assert result is not None
     return result
 
@@ -181,7 +185,7 @@ def test_where_nothing_is_in_view_nothing_is_known(rng: np.random.Generator) -> 
     behind = [-at for at in corner_points(rng)]
     levels = corner_edge_levels(corner_pixels(corner_points(rng)), behind)
     assert (
-        measure_posterior(Assumptions(levels, corner_window(corner_motions()), (), KNOWN_M, LENS_SIGMA), IDENTITY_POSE)
+        posterior_at(Assumptions(levels, corner_window(corner_motions()), (), KNOWN_M, LENS_SIGMA), IDENTITY_POSE)
         is None
     )
 
@@ -242,7 +246,7 @@ def test_an_uncertain_lens_makes_the_pose_uncertain(rng: np.random.Generator) ->
     levels, window = corner_edge_levels(corner_pixels(points), points), corner_window(corner_motions())
 
     def sigma_pitch(pixels: float) -> float:
-        result = measure_posterior(Assumptions(levels, window, (), KNOWN_M, (pixels, 0.002)), IDENTITY_POSE)
+        result = posterior_at(Assumptions(levels, window, (), KNOWN_M, (pixels, 0.002)), IDENTITY_POSE)
         assert result is not None
         return float(np.linalg.norm([one[0] for one in result.shifts(range(6)).values()]))
 
@@ -271,7 +275,7 @@ def test_one_frame_has_a_posterior(rng: np.random.Generator) -> None:
     (view, *_), window = corner_points(rng), corner_window(corner_motions(speed=0.0))
     alone: Window = replace(window, pairs=window.pairs[:1])
     levels = [replace(level, maps=level.maps[:1]) for level in corner_edge_levels(corner_pixels([view]), [view])]
-    result = measure_posterior(Assumptions(levels, alone, ALL_HELD, KNOWN_M, LENS_SIGMA), IDENTITY_POSE)
+    result = posterior_at(Assumptions(levels, alone, ALL_HELD, KNOWN_M, LENS_SIGMA), IDENTITY_POSE)
     assert result is not None
     sigma: Array = np.sqrt(result.hypotheses[0].covariance.diagonal()[:3])
     assert (sigma < 0.01).all()
@@ -296,9 +300,9 @@ def test_edges_that_fit_again_further_along_are_seen(
         seen = [np.concatenate(both) for both in zip(seen, further, strict=True)]
     levels, window = corner_edge_levels(seen, points), corner_window(corner_motions())
     assumed = Assumptions(levels, window, held, KNOWN_M, LENS_SIGMA)
-    result = measure_posterior(assumed, IDENTITY_POSE)
+    result = posterior_at(assumed, IDENTITY_POSE)
     assert result is not None
-    elsewhere = other_centre(assumed, IDENTITY_POSE, result, VerdictConfig().max_sigma_m)
+    elsewhere = other_centre(assumed, assumed.levels_at(IDENTITY_POSE), result, VerdictConfig().max_sigma_m)
     if ambiguous:
         assert elsewhere is not None
         assert elsewhere.axis == SHIFTS[2]

@@ -314,7 +314,8 @@ def _assessed(
         limits, fitted_px = config.verdict, lens_error_px(window.rig.camera_residual_px)
         lens = hypot(limits.principal_point_sigma * window.rig.camera.width, fitted_px), limits.focal_length_sigma
         assumed = Assumptions(edges.to_the_sharpest, window, held, held_to_m, lens)
-        posterior = measure_posterior(assumed, pose)
+        levels = assumed.levels_at(pose)
+        posterior = measure_posterior(assumed, levels)
         rivals = tuple(significance_next_to(assumed, rival) for rival in result.rivals)
         # A centre that nobody searched and that is a little off displaces most edges of a near scene.
         likely = pose
@@ -323,7 +324,7 @@ def _assessed(
         independent = independent_samples_at(edges.sharp, likely)
         of_range = float(edges.significances(edges.sharp, pose)[RANGE])
         if posterior is not None:
-            elsewhere = other_centre(assumed, pose, posterior, limits.max_sigma_m)
+            elsewhere = other_centre(assumed, levels, posterior, limits.max_sigma_m)
             uncertainty = _posterior_uncertainty(posterior, objective, pose, moved, window, independent.count)
             search = replace(search, T_camera_lidar=se3.perturb(pose, posterior.step(moved)))
     sigma = uncertainty.sigma

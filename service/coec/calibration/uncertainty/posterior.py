@@ -213,11 +213,15 @@ class Assumptions:
         """The places of a deviation that are free."""
         return (*TURNS, *SHIFTS, *(CLOCKS if moves(self.window) else ()), *LENS)
 
+    def levels_at(self, pose: Matrix4) -> list[AssumedEdges]:
+        """The levels of the edges, from which deviations are counted at `pose` (4, 4)."""
+        return assumed_levels(self.edges, self.window, pose)
+
 
 def significance_next_to(assumed: Assumptions, pose: Matrix4) -> float:
     """z of the edges at the most probable deviation from `pose` (4, 4) under the nominal hypothesis; infinite if they
     determine none."""
-    levels, prior = assumed_levels(assumed.edges, assumed.window, pose), _priors(assumed)[NOMINAL]
+    levels, prior = assumed.levels_at(pose), _priors(assumed)[NOMINAL]
     try:
         led = ascent(levels[-2:], np.zeros(SIZE), (*TURNS, *SHIFTS), prior, GENERAL_SHARE)
         return ascent(levels[-1:], led.deviation, assumed.places, prior, GENERAL_SHARE).significance
@@ -247,9 +251,11 @@ class OtherCentre:
     significance: float
 
 
-def other_centre(assumed: Assumptions, pose: Matrix4, posterior: Posterior, max_sigma_m: float) -> OtherCentre | None:
+def other_centre(
+    assumed: Assumptions, levels: Sequence[AssumedEdges], posterior: Posterior, max_sigma_m: float
+) -> OtherCentre | None:
     """The most significant other maximum along the translation that is least certain of those that were searched, about
-    the nominal hypothesis of the posterior at `pose` (4, 4); None if there is none.
+    the nominal hypothesis of the posterior on `levels`; None if there is none.
 
     Where markings are broken, and where the rings of the LiDAR cross them, edges lie on each other again a stride
     further along the road.
@@ -258,7 +264,6 @@ def other_centre(assumed: Assumptions, pose: Matrix4, posterior: Posterior, max_
     if not searched:
         return None
     nominal, prior = posterior.hypotheses[0], _priors(assumed)[NOMINAL]
-    sharp = assumed_levels(assumed.edges, assumed.window, pose)[-1:]
     sigma = np.sqrt(nominal.covariance.diagonal())
     along = max(searched, key=lambda place: float(sigma[place]))
     # The pose follows, not lens and clocks: these would undo the shift.
@@ -266,7 +271,7 @@ def other_centre(assumed: Assumptions, pose: Matrix4, posterior: Posterior, max_
     together[: SHIFTS.stop] = noise[:, along] / noise[along, along]
 
     def top(start: Vector) -> Ascent:
-        return ascent(sharp, start, assumed.places, prior, posterior.independent_share)
+        return ascent(levels[-1:], start, assumed.places, prior, posterior.independent_share)
 
     try:
         here = top(nominal.deviation)
@@ -278,9 +283,8 @@ def other_centre(assumed: Assumptions, pose: Matrix4, posterior: Posterior, max_
     return OtherCentre(along, max(separate) / max(here.significance, 1.0)) if separate else None
 
 
-def measure_posterior(assumed: Assumptions, pose: Matrix4) -> Posterior | None:
-    """The posterior of a window whose search ended at `pose` (4, 4); None if its edges determine no pose."""
-    levels = assumed_levels(assumed.edges, assumed.window, pose)
+def measure_posterior(assumed: Assumptions, levels: Sequence[AssumedEdges]) -> Posterior | None:
+    """The posterior of a window whose search ended at the pose of `levels`; None if its edges determine no pose."""
     places, priors = assumed.places, _priors(assumed)
     try:
         fits = _fits(levels, places, priors)
