@@ -33,8 +33,9 @@ lengths; the share by which the focal length is longer; and the share by which a
 
 SIZE = 13
 
-LEADING_POINTS, SETTLING_POINTS = 4_000, 20_000
-"""Most range edges that are used on a level that leads to the next one, and on the sharpest."""
+LEADING_POINTS, SETTLING_POINTS = 2_500, 30_000
+"""Most edges, of those that may come into view, that are used on a level that leads to the next one, and on the
+sharpest. See docs/measured.md."""
 
 SEEN = SearchBox(radians(15.0), 4.0)
 """How far from the assumed pose range edges are kept: what a wrong lens turns the camera by, and what passes at 40 m/s
@@ -96,8 +97,9 @@ def assumed_levels(edges: Sequence[EdgeFrames], window: Window, pose: Matrix4) -
     Edges that no deviation brings into view are left out."""
     counts = [*([LEADING_POINTS] * (len(edges) - 1)), SETTLING_POINTS]
     half_view_rad = half_field_of_view_rad(edges[0].camera, edges[0].maps[0] != VOID)
-    levels = [level.of_points(thinned(len(level.weight), count)) for level, count in zip(edges, counts, strict=True)]
-    return [_assumed_edges(in_reach(level, half_view_rad, pose, SEEN), window, pose) for level in levels]
+    seen = [in_reach(level, half_view_rad, pose, SEEN) for level in edges]
+    some = [level.of_points(thinned(len(level.weight), count)) for level, count in zip(seen, counts, strict=True)]
+    return [_assumed_edges(level, window, pose) for level in some]
 
 
 def _assumed_edges(frames: EdgeFrames, window: Window, pose: Matrix4) -> AssumedEdges:

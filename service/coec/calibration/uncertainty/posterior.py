@@ -47,11 +47,11 @@ from coec.geometry.edges.alignment import EdgeFrames
 
 NOMINAL, OTHER_MODE = "nominal", "other_mode"
 PRINCIPAL_POINT_OFF, FOCAL_LENGTH_OFF, LENS_OFF = "principal_point_off", "focal_length_off", "lens_off"
-CROPPED_ACROSS, CROPPED_DOWN = "cropped_across", "cropped_down"
+CROPPED_ACROSS, CROPPED_DOWN, RESCALED = "cropped_across", "cropped_down", "rescaled"
 CLOCKS_OFF, CENTRE_OFF = "clocks_free", "held_free"
 """Names of the hypotheses. They are also names of errors of a pose; see `Posterior.shifts`."""
 
-OF_LENS = (PRINCIPAL_POINT_OFF, FOCAL_LENGTH_OFF, CROPPED_ACROSS, CROPPED_DOWN, LENS_OFF)
+OF_LENS = (PRINCIPAL_POINT_OFF, FOCAL_LENGTH_OFF, CROPPED_ACROSS, CROPPED_DOWN, RESCALED, LENS_OFF)
 
 ODDS: Mapping[str, float] = MappingProxyType(
     {
@@ -61,6 +61,7 @@ ODDS: Mapping[str, float] = MappingProxyType(
         FOCAL_LENGTH_OFF: 0.05,
         CROPPED_ACROSS: 0.04,
         CROPPED_DOWN: 0.04,
+        RESCALED: 0.04,
         LENS_OFF: 0.02,
         CLOCKS_OFF: 0.04,
         CENTRE_OFF: 0.04,
@@ -319,6 +320,7 @@ def _priors(assumed: Assumptions) -> dict[str, Vector]:
         FOCAL_LENGTH_OFF: (LENS[2:], (LENS_DRIFT, 0.5 * LENS_DRIFT)),
         CROPPED_ACROSS: (LENS[:1], LENS_WRONG[:1]),
         CROPPED_DOWN: (LENS[1:2], LENS_WRONG[1:2]),
+        RESCALED: (LENS[2:3], LENS_WRONG[2:3]),
         LENS_OFF: (LENS, LENS_WRONG),
         **({CLOCKS_OFF: (CLOCKS, CLOCKS_WRONG)} if moves(assumed.window) else {}),
         **({CENTRE_OFF: (SHIFTS, (CENTRE_WRONG_M,) * 3)} if assumed.held else {}),
