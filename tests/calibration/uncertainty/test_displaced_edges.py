@@ -36,6 +36,18 @@ def level(rng: np.random.Generator) -> AssumedEdges:
     return assumed_levels(levels, corner_window(corner_motions()), IDENTITY_POSE)[-1]
 
 
+def test_edges_out_of_reach_displace_none_in_view(rng: np.random.Generator) -> None:
+    """A LiDAR that turns has most of its edges behind the camera."""
+    points = corner_points(rng)
+    pixels, window = corner_pixels(points), corner_window(corner_motions())
+    behind = np.array([[0.0, 0.0, -9.0]]) + rng.normal(0.0, 0.5, (20 * max(map(len, points)), 3))
+    around = [np.concatenate([at, behind.astype(at.dtype)]) for at in points]
+    alone, among = (
+        assumed_levels(corner_edge_levels(pixels, clouds), window, IDENTITY_POSE) for clouds in (points, around)
+    )
+    assert [len(one.frames.weight) for one in among] == [len(one.frames.weight) for one in alone]
+
+
 @pytest.mark.parametrize("place", PLACES)
 def test_the_jacobian_is_that_of_differences(level: AssumedEdges, place: int) -> None:
     deviation = 0.3 * STEPS

@@ -11,6 +11,7 @@ from coec.calibration.uncertainty.displaced_edges import CLOCKS, LENS, SHIFTS
 from coec.calibration.uncertainty.posterior import (
     CENTRE_OFF,
     CLOCKS_OFF,
+    CROPPED_DOWN,
     NAMES,
     NOMINAL,
     OF_LENS,
@@ -125,6 +126,22 @@ def test_a_grossly_wrong_lens_is_reported_from_the_pose_that_it_led_to(
     assert lens is not None
     assert result.probability(*OF_LENS) > 0.99
     assert lens.lens[:3] == pytest.approx([right, down, longer], abs=0.004)
+
+
+@pytest.mark.fault(
+    "a crop of a low image with the principal point of the whole one", "the window says so, with the size"
+)
+def test_a_crop_of_a_low_image_is_no_turn(rng: np.random.Generator) -> None:
+    """What a low image shows of it is little, so that only a hypothesis with one parameter more has the evidence."""
+    points, down = [at[np.abs(at[:, 1]) < 0.2 * at[:, 2]] for at in corner_points(rng)], 0.08
+    astray = se3.perturbation(np.array([-down, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    result = measured(
+        corner_edge_levels(corner_pixels(points, other_lens(0.0, down, 0.0)), points), corner_motions(), astray
+    )
+    cropped = result.of(CROPPED_DOWN)
+    assert cropped is not None
+    assert cropped.probability > 0.9
+    assert cropped.lens[1] == pytest.approx(down, abs=4.0 * cropped.lens_sigma[1])
 
 
 @pytest.mark.fault(
