@@ -358,16 +358,10 @@ def _general_optimum(levels: Sequence[AssumedEdges], places: tuple[int, ...], pr
     """The most significant deviation with every parameter free, whatever the lens that was assumed."""
     prior = np.max(list(priors.values()), axis=0)
     turning = (*TURNS, *LENS[:3])
-    coarse = levels[0].at(np.zeros(SIZE), turning)
-    of_coarse = metric(coarse)
-    answer = linalg.product(linalg.inverse(of_coarse[:3, :3]), of_coarse[:3, 3:])
-    begins = []
-    for longer in ZOOMS:
-        lenses = np.array([(right, down, longer) for right, down in product(OFFSETS, OFFSETS)])
-        starts = np.concatenate([-linalg.product(lenses, answer.T), lenses], axis=1)
-        begin = np.zeros(SIZE)
-        begin[list(turning)] = starts[np.argmax(coarse.significances(starts))]
-        begins.append(begin)
+    begins = [
+        _best_with_turns(levels[0], np.array([(right, down, longer) for right, down in product(OFFSETS, OFFSETS)]))
+        for longer in ZOOMS
+    ]
     ascended = [ascent(levels[:1], begin, turning, prior, GENERAL_SHARE) for begin in begins]
     ascended = sorted((end for end in ascended if _of_a_lens(end, prior)), key=lambda end: -end.significance)
     leading, begins = (*TURNS, *SHIFTS, *LENS[:3]), [np.zeros(SIZE), *(end.deviation for end in ascended[:ASCENTS])]
@@ -379,6 +373,48 @@ def _general_optimum(levels: Sequence[AssumedEdges], places: tuple[int, ...], pr
     best = max(settled, key=lambda end: end.significance)
     general = ascent(levels[-1:], best.deviation, places, prior, GENERAL_SHARE)
     return general if _of_a_lens(general, prior) else best
+
+
+MADE_UP = (1.0, 1.25, 1.5)
+"""Shares of the turn that makes up for a lens in the mean of the edges. Through a wide lens a pose may have made up for
+it in the middle of the image, where a pixel is a larger angle. See docs/measured.md."""
+
+
+def _best_with_turns(coarse: AssumedEdges, lenses: NDArray[np.float64]) -> Vector:
+    """(13,) the most significant of some lenses (K, 3), principal point and focal length, each with a turn that makes
+    up for it."""
+    turning, best = (*TURNS, *LENS[:3]), np.zeros(SIZE)
+    edges = coarse.at(best, turning)
+    of_edges = metric(edges)
+    answer = linalg.product(linalg.inverse(of_edges[:3, :3]), of_edges[:3, 3:])
+    turns = -linalg.product(lenses, answer.T)
+    starts = np.concatenate([np.concatenate([share * turns, lenses], axis=1) for share in MADE_UP])
+    best[list(turning)] = starts[np.argmax(edges.significances(starts))]
+    return best
+
+
+FINE_OFFSETS = (*OFFSETS, -0.075, -0.025, 0.025, 0.075)
+
+ONE_PARAMETER: Mapping[str, tuple[int, tuple[float, ...]]] = MappingProxyType(
+    {
+        CROPPED_ACROSS: (0, FINE_OFFSETS),
+        CROPPED_DOWN: (1, FINE_OFFSETS),
+        RESCALED: (2, ZOOMS),
+    }
+)
+"""By the name of a hypothesis with one parameter of the lens: its place, and values at which ascents may begin."""
+
+
+def _led_along(
+    levels: Sequence[AssumedEdges], name: str, places: tuple[int, ...], prior: Vector, share: float
+) -> Ascent | None:
+    """Where an ascent ends from the value of a single parameter of the lens that is the most significant one on the
+    coarsest edges; None if that is the value that was assumed, or if the hypothesis has more parameters."""
+    if name not in ONE_PARAMETER:
+        return None
+    place, values = ONE_PARAMETER[name]
+    begin = _best_with_turns(levels[0], np.array(values)[:, None] * np.eye(3)[place])
+    return ascent(levels, begin, places, prior, share) if begin.any() else None
 
 
 def _of_a_lens(end: Ascent, prior: Vector) -> bool:
@@ -481,14 +517,17 @@ def _alternative(
     of_nominal: Vector,
     prior: Vector,
 ) -> GaussianFit:
-    """The Gaussian of another hypothesis than the nominal one, from the higher of two places: the mean of the nominal
-    Gaussian, and where an ascent from the general optimum ends, as far as that is admissible."""
+    """The Gaussian of another hypothesis than the nominal one, from the highest of three places: the mean of the
+    nominal Gaussian; where an ascent from the general optimum ends, as far as that is admissible; and where one ends
+    that begins with a single parameter of the lens."""
     share = nominal.independent_share
     admissible = np.abs(general.deviation) <= ADMISSIBLE * prior
     end = ascent(levels[-1:], np.where(admissible, general.deviation, 0.0), places, prior, share)
+    led = _led_along(levels, name, places, prior, share)
     off = (nominal.mean / prior)[list(places)]
     there = 0.5 * share * nominal.significance**2 - 0.5 * float(np.sum(off * off))
-    top = max(end, Ascent(nominal.mean, nominal.significance, there), key=lambda place: place.log_posterior)
+    ends = (end, Ascent(nominal.mean, nominal.significance, there), *(() if led is None else (led,)))
+    top = max(ends, key=lambda place: place.log_posterior)
     # A place that is much higher is on another hill, of another width.
     same_hill = top.log_posterior - there <= AS_GOOD
     covariance = covariance_under(nominal, places, of_nominal, prior) if same_hill else None
