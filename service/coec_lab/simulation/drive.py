@@ -17,7 +17,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from coec.calibration.types import Frame, Matrix4, Rig
+from coec.calibration.types import Frame, LidarFrame, Matrix4, Rig
 from coec.errors import UsageError
 from coec.geometry.cameras import Camera, build, intrinsics_of, name_of
 from coec.geometry.se3 import inverse, perturb
@@ -225,6 +225,11 @@ class SimulatedDrive:
         """See `Recording.messages`."""
         for entry in self._plan if cameras is None else needed(self._plan, cameras, _CAMERA, _LIDAR, _EGO):
             yield self._message(entry)
+
+    def sweeps(self, stamps_ns: Collection[int]) -> Iterator[LidarFrame]:
+        """See `Recording.sweeps`."""
+        wanted = (entry for entry in self._plan if entry.stream == _LIDAR and entry.stamp_ns in stamps_ns)
+        return (frame for frame in map(self._message, wanted) if isinstance(frame, LidarFrame))
 
     def part(self, begin: int, end: int) -> list[Frame]:
         """Messages `begin` to `end` (excluded) of `messages()`, so that several processes can share the work."""

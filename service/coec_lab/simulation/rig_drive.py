@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.frames.pairing import Pairer
-from coec.calibration.types import Frame, FramePair, Matrix4, Rig
+from coec.calibration.types import Frame, FramePair, LidarFrame, Matrix4, Rig
 from coec.config import PairingConfig
 from coec.errors import UsageError
 from coec.geometry.cameras import Camera
@@ -360,6 +360,12 @@ class SimulatedRigPair:
             entries = list(needed(entries, cameras, of(self._camera), of(self._lidar), of(EGO)))
         for entry in entries:
             yield self._drive.message(entry)
+
+    def sweeps(self, stamps_ns: Collection[int]) -> Iterator[LidarFrame]:
+        """See `Recording.sweeps`."""
+        lidar = self._drive.stream(self._lidar)
+        wanted = (entry for entry in self._plan if entry.stream == lidar and entry.stamp_ns in stamps_ns)
+        return (frame for frame in map(self._drive.message, wanted) if isinstance(frame, LidarFrame))
 
     @cached_property
     def _plan(self) -> list[Arrival]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
@@ -11,78 +10,14 @@ from numpy.typing import NDArray
 
 from coec.calibration.rig.lidar_registration import register
 from coec.calibration.rig.lidar_sampling import LidarEdge, LidarRig, SweepPair
-from coec.calibration.types import EgoMotion, LidarFrame, Matrix4
+from coec.calibration.types import EgoMotion, LidarFrame
 from coec.geometry import se3
+from support.surroundings import NOISE_M, BruteForceSearch, Shape, corridor, room, sweep
 
 Doubles = NDArray[np.float64]
 
 T_A_EGO = se3.perturbation(np.array([0.02, -0.01, 0.3, -1.0, 0.2, -1.8]))
 T_A_B = se3.perturbation(np.array([0.05, -0.03, 1.4, 0.1, 0.9, -0.8]))
-NOISE_M = 0.02
-
-
-class BruteForce:
-    """Every distance, as slow as it is plain."""
-
-    def __init__(self, points_m: Doubles) -> None:
-        self._points_m = points_m
-
-    def nearest(self, queries_m: Doubles, count: int) -> tuple[NDArray[np.int64], Doubles]:
-        points = self._points_m
-        separation = (queries_m**2).sum(axis=1)[:, None] + (points**2).sum(axis=1) - 2.0 * queries_m @ points.T
-        detected = np.argpartition(separation, count - 1, axis=1)[:, :count]
-        squared = np.take_along_axis(separation, detected, axis=1)
-        order = np.argsort(squared, axis=1, kind="stable")
-        return np.take_along_axis(detected, order, axis=1), np.take_along_axis(squared, order, axis=1)
-
-
-class Search:
-    """A `NeighbourSearch`."""
-
-    def over(self, points_m: Doubles) -> BruteForce:
-        return BruteForce(points_m)
-
-
-Shape = Callable[[np.random.Generator, int], Doubles]
-
-
-def room(rng: np.random.Generator, count: int) -> Doubles:
-    """Points on floor, two walls along x and one across, about the vehicle; world is the ego frame at the instant."""
-    part = rng.integers(0, 4, count)
-    x, y, z = rng.uniform(-4, 4, count), rng.uniform(-3, 3, count), rng.uniform(0, 2.5, count)
-    floor = np.column_stack([x, y, np.zeros(count)])
-    left = np.column_stack([x, np.full(count, 3.0), z])
-    right = np.column_stack([x, np.full(count, -3.0), z])
-    end = np.column_stack([np.full(count, 4.0), y, z])
-    return np.choose(part[:, None], [floor, left, right, end])
-
-
-def corridor(rng: np.random.Generator, count: int) -> Doubles:
-    """The same without the wall across: nothing tells how far along it anybody is."""
-    points = room(rng, count)
-    across = points[:, 0] == 4.0
-    points[across] = np.column_stack(
-        [rng.uniform(-4, 4, across.sum()), np.full(across.sum(), 3.0), rng.uniform(0, 2.5, across.sum())]
-    )
-    return points
-
-
-def sweep(
-    points_m: Doubles, T_lidar_ego: Matrix4, name: str, rng: np.random.Generator, *, longer_m: float = 0.0,
-    after_s: Doubles | None = None, motion: EgoMotion | None = None, stamp_ns: int = 0,
-) -> LidarFrame:  # fmt: skip
-    """Points (N, 3) of the ego frame at the instant 0, as a LiDAR measures them, each `after_s` later."""
-    local = points_m @ T_lidar_ego[:3, :3].T + T_lidar_ego[:3, 3]
-    if after_s is not None and motion is not None:
-        assert motion.linear_mps is not None
-        twist = np.array([*motion.angular_radps, *motion.linear_mps])
-        for i, seconds in enumerate(after_s):
-            ego = se3.inverse(se3.exp(twist * seconds))
-            local[i] = (T_lidar_ego @ ego @ np.array([*points_m[i], 1.0]))[:3]
-    range_m = np.linalg.norm(local, axis=1, keepdims=True)
-    local *= (range_m + longer_m + rng.normal(0, NOISE_M, range_m.shape)) / range_m
-    offsets = None if after_s is None else (after_s - stamp_ns * 1e-9).astype(np.float32)
-    return LidarFrame(stamp_ns, name, local.astype(np.float32), time_offset_s=offsets)
 
 
 def drive(shape: Shape, seed: int, *, pairs: int = 3, longer_m: float = 0.0, count: int = 1500) -> list[SweepPair]:
@@ -97,7 +32,7 @@ def drive(shape: Shape, seed: int, *, pairs: int = 3, longer_m: float = 0.0, cou
 
 def edge(pairs: list[SweepPair], off: Doubles) -> LidarEdge:
     """Registered from a nominal pose that is wrong by ξ `off` (6,)."""
-    return register(LidarRig("a", "b", se3.perturb(T_A_B, off), T_A_EGO), pairs, Search())
+    return register(LidarRig("a", "b", se3.perturb(T_A_B, off), T_A_EGO), pairs, BruteForceSearch())
 
 
 def error(detected: LidarEdge) -> Doubles:
@@ -140,8 +75,8 @@ def test_moving_b_by_s_moves_its_pose_by_the_inverse() -> None:
         )
         for p in pairs
     ]
-    before = register(LidarRig("a", "b", T_A_B, T_A_EGO), pairs, Search())
-    after = register(LidarRig("a", "b", T_A_B @ se3.inverse(shift), T_A_EGO), moved, Search())
+    before = register(LidarRig("a", "b", T_A_B, T_A_EGO), pairs, BruteForceSearch())
+    after = register(LidarRig("a", "b", T_A_B @ se3.inverse(shift), T_A_EGO), moved, BruteForceSearch())
     # Another choice of points, one in every cube, is another draw of the noise.
     separation = se3.difference(after.T_a_b @ shift, before.T_a_b)
     assert np.rad2deg(np.abs(separation[:3])).max() < 0.1
@@ -154,9 +89,9 @@ def test_the_pose_of_a_in_b_is_the_inverse() -> None:
     b = sweep(room(rng, 2200), se3.inverse(T_A_B) @ T_A_EGO, "b", rng)
     off = np.array([0.0, 0.0, np.deg2rad(1.0), 0.0, 0.03, 0.0])
     start = se3.perturb(T_A_B, off)
-    there = register(LidarRig("a", "b", start, T_A_EGO), [SweepPair(a, b, None)], Search())
+    there = register(LidarRig("a", "b", start, T_A_EGO), [SweepPair(a, b, None)], BruteForceSearch())
     T_b_ego = se3.inverse(T_A_B) @ T_A_EGO
-    back = register(LidarRig("b", "a", se3.inverse(start), T_b_ego), [SweepPair(b, a, None)], Search())
+    back = register(LidarRig("b", "a", se3.inverse(start), T_b_ego), [SweepPair(b, a, None)], BruteForceSearch())
     separation = se3.difference(there.T_a_b, se3.inverse(back.T_a_b))
     # Points of the one on planes of the other, and the other way round: not the same draw of the noise.
     sigma = np.hypot(there.sigma, (np.abs(se3.adjoint(there.T_a_b)) @ back.sigma))

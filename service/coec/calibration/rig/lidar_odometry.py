@@ -28,8 +28,16 @@ FAST_MPS, DIRECTIONS = 20.0, 8
 """Speed of the velocities at which registrations begin beside standstill, and number of their directions in the plane
 of the LiDAR. See docs/measured.md."""
 
-ROUNDS = 4
-"""Most registrations from one velocity on."""
+ROUNDS, REFINED = 4, 3
+"""Most registrations from one velocity on, and how many of the velocities are refined by more than one: those that put
+most points onto surfaces."""
+
+SEARCHES = 3
+"""How often a velocity is sought from all beginnings: on a motorway none is found."""
+
+OTHER_MPS, ABOUT_AS_MANY = 1.0, 0.9
+"""A velocity is ambiguous if another one, so far away, puts at least this share of the points onto surfaces. See
+docs/measured.md."""
 
 RESTS_RAD, RESTS_M = radians(0.02), 0.005
 """Registrations end with a correction below this: at the ends of a sweep it displaces points by half of it."""
@@ -46,50 +54,63 @@ def motions_of_sweeps(
 ) -> Iterator[EgoMotion | None]:
     """The motion of a LiDAR in its own frame over each of some pairs of consecutive sweeps, with the stamp of the
     earlier one; None where the surroundings do not determine it. The velocity is None where they determine the turn
-    alone, as in a tunnel.
+    alone, as in a tunnel, or where sweeps fit about as well at another velocity, as on a motorway.
 
     Args:
         consecutive: earlier and later sweep of each pair.
         timing: how the time of a point follows from its azimuth, if the sweeps do not carry it.
         search: of neighbours among the points of a sweep.
     """
-    before: Twist | None = None
+    before, searches = np.zeros(6), 0
     for earlier, later in consecutive:
         if not 0 < later.stamp_ns - earlier.stamp_ns <= MAX_SEPARATION_S * 1e9:
             yield None
             continue
         sweeps = _ConsecutiveSweeps(earlier, _some_points(later), timing, search)
-        end = None if before is None else sweeps.registered(before, ROUNDS)
-        if end is None or not end.knows_velocity:
-            first = max((sweeps.registered(begin, 1) for begin in _beginnings()), key=lambda one: one.edge.points)
-            end = sweeps.registered(first.twist, ROUNDS)
-        before = end.twist if end.knows_velocity else None
-        yield end.motion(earlier)
+        ends = [sweeps.registered(before, ROUNDS), sweeps.registered(np.zeros(6), 1)]
+        unambiguous = bool(before.any()) and _is_unambiguous(ends)
+        if not unambiguous and searches < SEARCHES:
+            searches += 1
+            coarse = sorted((sweeps.registered(begin, 1) for begin in _fast()), key=lambda one: -one.edge.points)
+            ends += [*(sweeps.registered(one.twist, ROUNDS) for one in coarse[:REFINED]), *coarse[REFINED:]]
+            unambiguous = _is_unambiguous(ends)
+        best = _best(ends)
+        before = best.twist if unambiguous else np.zeros(6)
+        yield best.motion(earlier, velocity=unambiguous)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Registered:
-    """A motion (6,), rad/s and m/s in the frame of the LiDAR, and the registration that found nothing left to correct
-    of it."""
+    """A motion (6,), rad/s and m/s in the frame of the LiDAR, and the registration that led to it."""
 
     twist: Twist
     edge: LidarEdge
 
     @property
-    def knows_velocity(self) -> bool:
-        return self._knows_turn and bool((self.edge.sigma[3:] <= MOST_SIGMA_M).all())
-
-    @property
-    def _knows_turn(self) -> bool:
+    def knows_turn(self) -> bool:
         return not self.edge.reasons and bool((self.edge.sigma[:3] <= MOST_SIGMA_RAD).all())
 
-    def motion(self, earlier: LidarFrame) -> EgoMotion | None:
+    @property
+    def knows_velocity(self) -> bool:
+        return self.knows_turn and bool((self.edge.sigma[3:] <= MOST_SIGMA_M).all())
+
+    def motion(self, earlier: LidarFrame, *, velocity: bool) -> EgoMotion | None:
         wx, wy, wz, vx, vy, vz = self.twist.tolist()
-        if not self._knows_turn:
+        if not self.knows_turn:
             return None
-        return EgoMotion(
-            earlier.stamp_ns, earlier.frame_id, (vx, vy, vz) if self.knows_velocity else None, (wx, wy, wz)
-        )
+        return EgoMotion(earlier.stamp_ns, earlier.frame_id, (vx, vy, vz) if velocity else None, (wx, wy, wz))
+
+
+def _best(ends: list[_Registered]) -> _Registered:
+    return max(ends, key=lambda one: one.edge.points)
+
+
+def _is_unambiguous(ends: list[_Registered]) -> bool:
+    """Whether the best of some ends determines a velocity, and no other of another velocity puts about as many points
+    onto surfaces."""
+    best = _best(ends)
+    others = (one for one in ends if np.linalg.norm(one.twist[3:] - best.twist[3:]) > OTHER_MPS)
+    return best.knows_velocity and all(one.edge.points < ABOUT_AS_MANY * best.edge.points for one in others)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,11 +136,10 @@ class _ConsecutiveSweeps:
         return _Registered(twist, edge)
 
 
-def _beginnings() -> list[Twist]:
-    """(6,) each: standstill, and velocities in the plane of the LiDAR."""
+def _fast() -> list[Twist]:
+    """(6,) each: velocities in the plane of the LiDAR."""
     angles = [tau * k / DIRECTIONS for k in range(DIRECTIONS)]
-    fast = [np.array([0.0, 0.0, 0.0, FAST_MPS * cos(angle), FAST_MPS * sin(angle), 0.0]) for angle in angles]
-    return [np.zeros(6), *fast]
+    return [np.array([0.0, 0.0, 0.0, FAST_MPS * cos(angle), FAST_MPS * sin(angle), 0.0]) for angle in angles]
 
 
 def _some_points(sweep: LidarFrame) -> LidarFrame:

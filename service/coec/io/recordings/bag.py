@@ -307,6 +307,14 @@ class BagRecording:
                 (KINDS[kind], stamp_ns, partial(load, kind, item)) for stamp_ns, kind, _, item in ordered
             )
 
+    def sweeps(self, stamps_ns: Collection[int]) -> Iterator[LidarFrame]:
+        """See `Recording.sweeps`."""
+        places = [place for place in self.streams.lidar if place.stamp_ns in stamps_ns]
+        with self.storage.open() as reader:
+            yield from self.damaged.sound(
+                (CLOUD, place.stamp_ns, partial(self._sweep, reader, place)) for place in places
+            )
+
     def recognised(self) -> BagRecording:
         """The recording with its sweeps as their points show them: clouds that are parts of a turn are joined, and
         points that were compensated for motion already have one time.

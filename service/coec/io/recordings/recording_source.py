@@ -144,6 +144,14 @@ class RecordingSource(Protocol):
             SourceError: a file cannot be read; names it.
         """
 
+    def sweeps(self, stamps_ns: Collection[int]) -> Iterator[LidarFrame]:
+        """The sweeps of some of `sweep_stamps_ns`, ascending; damaged ones are left out.
+
+        Raises:
+            SourceError: a file cannot be read, or no sweep of several can; names it.
+        """
+        ...
+
 
 @runtime_checkable
 class HasGroundTruth(Protocol):
@@ -241,6 +249,11 @@ class FramewiseRecording:
             queue.append((motion.stamp_ns, _EGO, place, lambda motion=motion: motion))  # type: ignore[misc]
         ordered = sorted(queue, key=lambda entry: entry[:3])
         yield from self.damaged.sound((KINDS[kind], stamp_ns, load) for stamp_ns, kind, _, load in ordered)
+
+    def sweeps(self, stamps_ns: Collection[int]) -> Iterator[LidarFrame]:
+        """See `Recording.sweeps`."""
+        places = {frame.lidar_stamp_ns: frame.load_lidar for frame in self.frames if frame.lidar_stamp_ns in stamps_ns}
+        yield from self.damaged.sound((CLOUD, stamp_ns, places[stamp_ns]) for stamp_ns in sorted(places))
 
 
 def selected_indices(cameras: Collection[int] | None, count: int) -> list[int]:

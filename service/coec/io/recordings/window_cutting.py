@@ -3,6 +3,7 @@ recording that holds more than the window.
 """
 
 import math
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -12,17 +13,31 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from coec.calibration.frames import evidence
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.frames.window import BetweenPairs
-from coec.calibration.types import MOUNT_RAD, NS_PER_S, CameraFrame, Frame, FramePair, Matrix4, Recognition, Window
+from coec.calibration.rig.lidar_odometry import MAX_SEPARATION_S, motions_of_sweeps
+from coec.calibration.types import (
+    MOUNT_RAD,
+    NS_PER_S,
+    CameraFrame,
+    Frame,
+    FramePair,
+    Matrix4,
+    Recognition,
+    Rig,
+    Window,
+)
 from coec.config import CalibrationConfig, Config, LimitsConfig, PairingConfig, WindowConfig
 from coec.errors import DecodeError, SourceError, UsageError
 from coec.geometry import se3
 from coec.geometry.cameras import Camera
 from coec.geometry.projection import half_field_of_view_rad
+from coec.io import nearest_neighbours
 from coec.io.frame_validation import Refusal
 from coec.io.images import CompressingReducer, decode_grey_reduced
 from coec.io.mcap.windows import is_window, read_result, read_window
+from coec.io.recordings.bag_recognition import as_compensated, compensated
 from coec.io.recordings.clocks import clock_separation_text, clocks_text
 from coec.io.recordings.layouts import RecordingSource, open_source
 from coec.io.recordings.recording_source import (
@@ -132,14 +147,61 @@ def window_of_recording(
             f"{recording.name}: none of {requested} camera frames has a sweep within "
             f"{PairingConfig().tolerance_s} s: {clocks_text(recording.camera_stamps_ns, recording.sweep_stamps_ns)}"
         )
-    window_id = f"{recording.rig.pair}-{pairs[0].stamp_ns}"
-    window = Window(window_id, recording.rig, recording.T_camera_lidar_start, tuple(pairs), MOUNT_RAD)
-    recognised = recognitions_of(recording, (pair.lidar for pair in pairs))
+    rig, pairs, of_motion = _with_motion(recording, pairs)
+    window_id = f"{rig.pair}-{pairs[0].stamp_ns}"
+    window = Window(window_id, rig, recording.T_camera_lidar_start, tuple(pairs), MOUNT_RAD)
+    recognised = (*recognitions_of(recording, (pair.lidar for pair in pairs)), *of_motion)
     separate = clock_separation_text(recording.camera_stamps_ns, recording.sweep_stamps_ns)
     if separate:
         recognised = (Recognition("clocks_apart", f"Frames find the wrong sweeps: {separate}.", "fail"), *recognised)
     unpaired = {cause: number for cause, number in losses.items() if number}
     return LoadedWindow(window, recording.configuration, _default_vehicle(), unpaired, recognised)
+
+
+def _with_motion(
+    recording: RecordingSource, pairs: list[FramePair]
+) -> tuple[Rig, list[FramePair], tuple[Recognition, ...]]:
+    """The rig and the pairs of a recording without ego-motion, with the motion of its LiDAR from sweep to sweep, and
+    what to tell; unchanged where its sweeps were not taken one after the other on a moving vehicle, or have no times of
+    points to compensate."""
+    rig, stamps_ns = recording.rig, recording.sweep_stamps_ns
+    timed = all(pair.lidar.time_offset_s is not None and np.ptp(pair.lidar.time_offset_s) > 0.0 for pair in pairs)
+    neighbours = [_neighbour(stamps_ns, pair.lidar.stamp_ns) for pair in pairs]
+    known = [stamp_ns for stamp_ns in neighbours if stamp_ns is not None]
+    unknown = recording.motion_stamps_ns or not known or not (timed or rig.sweep)
+    if unknown or evidence.stands([pair.lidar for pair in pairs]):
+        return rig, pairs, ()
+    if not nearest_neighbours.installed():
+        text = (
+            "No ego-motion: sweeps taken while driving are not compensated. With the optional extra `lidars` "
+            "(pip install 'coec[lidars]') it is measured from sweep to sweep."
+        )
+        return rig, pairs, (Recognition("motion_unknown", text, "warn"),)
+    sweeps = {sweep.stamp_ns: sweep for sweep in recording.sweeps(known)}
+    consecutive = [
+        (first, second) if first.stamp_ns < second.stamp_ns else (second, first)
+        for pair, stamp_ns in zip(pairs, neighbours, strict=True)
+        for first, second in ((pair.lidar, sweeps.get(stamp_ns or 0, pair.lidar)),)
+    ]
+    motions = list(motions_of_sweeps(consecutive, rig.sweep, nearest_neighbours.Trees()))
+    measured = sum(motion is not None for motion in motions)
+    text = f"No ego-motion is recorded: it is measured by registering sweeps, for {measured} of {len(pairs)} pairs."
+    moving = [replace(pair, motion=motion) for pair, motion in zip(pairs, motions, strict=True)]
+    known_motions = [motion for motion in motions if motion is not None]
+    instant, of_points = compensated([pair.lidar for pair in pairs], known_motions, np.eye(4), "?compensated=no")
+    if instant is not None:
+        moving = [replace(pair, lidar=as_compensated(pair.lidar, instant)) for pair in moving]
+    recognised = (Recognition("motion_registered", text), *(() if of_points is None else (of_points,)))
+    return replace(rig, T_lidar_ego=np.eye(4)), moving, recognised
+
+
+def _neighbour(stamps_ns: Sequence[int], stamp_ns: int) -> int | None:
+    """The stamp next to one of several, ascending, within `MAX_SEPARATION_S`; the later one if both are."""
+    place = bisect_left(stamps_ns, stamp_ns)
+    for other in (*stamps_ns[place + 1 : place + 2], *stamps_ns[max(place - 1, 0) : place]):
+        if 0 < abs(other - stamp_ns) <= MAX_SEPARATION_S * NS_PER_S:
+            return other
+    return None
 
 
 def _of_size(camera: Camera, pairs: Sequence[FramePair], damaged: DamagedFrames) -> list[FramePair]:

@@ -1,0 +1,79 @@
+"""Surroundings of a LiDAR, its sweeps of them, and a search of neighbours that is an oracle."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coec.calibration.types import EgoMotion, LidarFrame, Matrix4
+from coec.geometry import se3
+
+Doubles = NDArray[np.float64]
+
+NOISE_M = 0.02
+
+
+class BruteForce:
+    """Every distance, as slow as it is plain."""
+
+    def __init__(self, points_m: Doubles) -> None:
+        self._points_m = points_m
+
+    def nearest(self, queries_m: Doubles, count: int) -> tuple[NDArray[np.int64], Doubles]:
+        points = self._points_m
+        separation = (queries_m**2).sum(axis=1)[:, None] + (points**2).sum(axis=1) - 2.0 * queries_m @ points.T
+        detected = np.argpartition(separation, count - 1, axis=1)[:, :count]
+        squared = np.take_along_axis(separation, detected, axis=1)
+        order = np.argsort(squared, axis=1, kind="stable")
+        return np.take_along_axis(detected, order, axis=1), np.take_along_axis(squared, order, axis=1)
+
+
+class BruteForceSearch:
+    """A `NeighbourSearch`."""
+
+    def over(self, points_m: Doubles) -> BruteForce:
+        return BruteForce(points_m)
+
+
+Shape = Callable[[np.random.Generator, int], Doubles]
+
+
+def room(rng: np.random.Generator, count: int) -> Doubles:
+    """Points on floor, two walls along x and one across, about the vehicle; world is the ego frame at the instant."""
+    part = rng.integers(0, 4, count)
+    x, y, z = rng.uniform(-4, 4, count), rng.uniform(-3, 3, count), rng.uniform(0, 2.5, count)
+    floor = np.column_stack([x, y, np.zeros(count)])
+    left = np.column_stack([x, np.full(count, 3.0), z])
+    right = np.column_stack([x, np.full(count, -3.0), z])
+    end = np.column_stack([np.full(count, 4.0), y, z])
+    return np.choose(part[:, None], [floor, left, right, end])
+
+
+def corridor(rng: np.random.Generator, count: int) -> Doubles:
+    """The same without the wall across: nothing tells how far along it anybody is."""
+    points = room(rng, count)
+    across = points[:, 0] == 4.0
+    points[across] = np.column_stack(
+        [rng.uniform(-4, 4, across.sum()), np.full(across.sum(), 3.0), rng.uniform(0, 2.5, across.sum())]
+    )
+    return points
+
+
+def sweep(
+    points_m: Doubles, T_lidar_ego: Matrix4, name: str, rng: np.random.Generator, *, longer_m: float = 0.0,
+    after_s: Doubles | None = None, motion: EgoMotion | None = None, stamp_ns: int = 0,
+) -> LidarFrame:  # fmt: skip
+    """Points (N, 3) of the ego frame at the instant 0, as a LiDAR measures them, each `after_s` later."""
+    local = points_m @ T_lidar_ego[:3, :3].T + T_lidar_ego[:3, 3]
+    if after_s is not None and motion is not None:
+        assert motion.linear_mps is not None
+        twist = np.array([*motion.angular_radps, *motion.linear_mps])
+        for i, seconds in enumerate(after_s):
+            ego = se3.inverse(se3.exp(twist * seconds))
+            local[i] = (T_lidar_ego @ ego @ np.array([*points_m[i], 1.0]))[:3]
+    range_m = np.linalg.norm(local, axis=1, keepdims=True)
+    local *= (range_m + longer_m + rng.normal(0, NOISE_M, range_m.shape)) / range_m
+    offsets = None if after_s is None else (after_s - stamp_ns * 1e-9).astype(np.float32)
+    return LidarFrame(stamp_ns, name, local.astype(np.float32), time_offset_s=offsets)
