@@ -34,11 +34,13 @@ from coec.calibration.verdict import (
     on_the_sharpest,
     optimum_metrics,
     range_metric,
+    reason_details,
     repetition_metric,
     shape_metrics,
 )
 from coec.config import CalibrationConfig, SearchConfig, VerdictConfig
 from coec.geometry import se3
+from support.scenes import corner_motions, corner_window
 
 LIMITS = VerdictConfig()
 GOOD = Evaluation(score=1.4, frame_scores=np.full(10, 1.4), mi=1.4, overlap=0.9, points_in_view=10_000)
@@ -302,3 +304,11 @@ def test_a_window_through_another_lens_is_refused_for_that(distribution: Posteri
     assert verdict.shows_another_lens is refused
     if refused:
         assert verdict.is_inconclusive
+
+
+@pytest.mark.parametrize(("probability", "said"), [(0.12, True), (0.02, False), (0.7, False)])
+def test_an_uncertain_rotation_names_a_lens_that_is_not_excluded(probability: float, said: bool) -> None:
+    """Above even odds, the other lens is a reason of its own."""
+    distribution = posterior_of(nominal=1.0 - probability, cropped_down=probability)
+    text = reason_details(distribution, None, corner_window(corner_motions()))["sigma_deg"]
+    assert (f"other intrinsics have a probability of {probability:.0%}: focal length +0.0 %" in text) is said

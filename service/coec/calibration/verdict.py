@@ -215,32 +215,42 @@ def reason_details(
     distribution: posterior.Posterior | None, moved: MovedWithin | None, window: Window
 ) -> Mapping[str, str]:
     """By the name of a metric, what its failure means in this window."""
+    lens = _lens_text(distribution, window)
     return {
-        "sigma_deg": "" if distribution is None else _contradictions_text(distribution),
-        INTRINSICS_OFF: "" if distribution is None else _lens_text(distribution, window),
+        "sigma_deg": "" if distribution is None else _contradictions_text(distribution, lens),
+        INTRINSICS_OFF: f" ({lens})" if lens else "",
         MOVED: "" if moved is None else _move_text(moved, window),
     }
 
 
-def _contradictions_text(distribution: posterior.Posterior) -> str:
-    """Which assumptions the window contradicts, and by how much the camera turns without each."""
+PERHAPS = 0.05
+"""Least probability of other intrinsics with which an uncertain rotation is said to come from them."""
+
+
+def _contradictions_text(distribution: posterior.Posterior, lens: str) -> str:
+    """Which assumptions the window contradicts, and by how much the camera turns without each; and the most probable
+    other `lens`, if it does not exclude one."""
     turns = [
         f"estimating {_CONTRADICTED[one.name]}, too, turns it by "
         f"{degrees(float(np.linalg.norm((one.deviation - distribution.hypotheses[0].deviation)[:3]))):.1f}°"
         for one in distribution.hypotheses
         if one.name in _CONTRADICTED and one.probability >= 0.5
     ]
+    of_lens = distribution.probability(*posterior.OF_LENS)
+    if PERHAPS <= of_lens < 0.5:
+        turns.append(f"other intrinsics have a probability of {of_lens:.0%}: {lens}")
     return f" ({'; '.join(turns)})" if turns else ""
 
 
-def _lens_text(distribution: posterior.Posterior, window: Window) -> str:
-    lens = distribution.of(*posterior.OF_LENS)
+def _lens_text(distribution: posterior.Posterior | None, window: Window) -> str:
+    """How the most probable other intrinsics differ from those of the rig; empty if none were tried."""
+    lens = None if distribution is None else distribution.of(*posterior.OF_LENS)
     if lens is None:
         return ""
     (right, down, longer, _), camera = lens.lens.tolist(), window.rig.camera
     return (
-        f" (focal length {100.0 * longer:+.1f} %, principal point {right * camera.fx:+.1f} px right and "
-        f"{down * camera.fy:+.1f} px down)"
+        f"focal length {100.0 * longer:+.1f} %, principal point {right * camera.fx:+.1f} px right and "
+        f"{down * camera.fy:+.1f} px down"
     )
 
 
