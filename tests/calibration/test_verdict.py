@@ -306,9 +306,9 @@ def test_a_window_through_another_lens_is_refused_for_that(distribution: Posteri
         assert verdict.is_inconclusive
 
 
-@pytest.mark.parametrize(("probability", "said"), [(0.12, True), (0.02, False), (0.7, False)])
-def test_an_uncertain_rotation_names_a_lens_that_is_not_excluded(probability: float, said: bool) -> None:
+@pytest.mark.parametrize(("probability", "is_named"), [(0.12, True), (0.02, False), (0.7, False)])
+def test_an_uncertain_rotation_names_a_lens_that_is_not_excluded(probability: float, is_named: bool) -> None:
     """Above even odds, the other lens is a reason of its own."""
     distribution = posterior_of(nominal=1.0 - probability, cropped_down=probability)
     text = reason_details(distribution, None, corner_window(corner_motions()))["sigma_deg"]
-    assert (f"other intrinsics have a probability of {probability:.0%}: focal length +0.0 %" in text) is said
+    assert (f"other intrinsics have a probability of {probability:.0%}: focal length +0.0 %" in text) is is_named

@@ -223,7 +223,7 @@ def reason_details(
     }
 
 
-PERHAPS = 0.05
+NOT_EXCLUDED = 0.05
 """Least probability of other intrinsics with which an uncertain rotation is said to come from them."""
 
 
@@ -237,7 +237,7 @@ def _contradictions_text(distribution: posterior.Posterior, lens: str) -> str:
         if one.name in _CONTRADICTED and one.probability >= 0.5
     ]
     of_lens = distribution.probability(*posterior.OF_LENS)
-    if PERHAPS <= of_lens < 0.5:
+    if NOT_EXCLUDED <= of_lens < 0.5:
         turns.append(f"other intrinsics have a probability of {of_lens:.0%}: {lens}")
     return f" ({'; '.join(turns)})" if turns else ""
 

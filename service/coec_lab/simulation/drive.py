@@ -228,8 +228,8 @@ class SimulatedDrive:
 
     def sweeps(self, stamps_ns: Collection[int]) -> Iterator[LidarFrame]:
         """See `Recording.sweeps`."""
-        wanted = (entry for entry in self._plan if entry.stream == _LIDAR and entry.stamp_ns in stamps_ns)
-        return (frame for frame in map(self._message, wanted) if isinstance(frame, LidarFrame))
+        required = (entry for entry in self._plan if entry.stream == _LIDAR and entry.stamp_ns in stamps_ns)
+        return (frame for frame in map(self._message, required) if isinstance(frame, LidarFrame))
 
     def part(self, begin: int, end: int) -> list[Frame]:
         """Messages `begin` to `end` (excluded) of `messages()`, so that several processes can share the work."""

@@ -364,8 +364,8 @@ class SimulatedRigPair:
     def sweeps(self, stamps_ns: Collection[int]) -> Iterator[LidarFrame]:
         """See `Recording.sweeps`."""
         lidar = self._drive.stream(self._lidar)
-        wanted = (entry for entry in self._plan if entry.stream == lidar and entry.stamp_ns in stamps_ns)
-        return (frame for frame in map(self._drive.message, wanted) if isinstance(frame, LidarFrame))
+        required = (entry for entry in self._plan if entry.stream == lidar and entry.stamp_ns in stamps_ns)
+        return (frame for frame in map(self._drive.message, required) if isinstance(frame, LidarFrame))
 
     @cached_property
     def _plan(self) -> list[Arrival]:

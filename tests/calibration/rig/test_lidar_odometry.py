@@ -23,7 +23,7 @@ def consecutive(shape: Shape, motion: EgoMotion, *, turns: float = 1.0, seed: in
     for number, count in ((0, 5_000), (1, 2_500)):
         stamp_s = number * turns * TURN_S
         after_s = stamp_s + rng.uniform(-0.5 * TURN_S, 0.5 * TURN_S, count)
-        measured = sweep(
+        frame = sweep(
             1.5 * shape(rng, count),
             T_LIDAR_EGO,
             "lidar",
@@ -32,7 +32,7 @@ def consecutive(shape: Shape, motion: EgoMotion, *, turns: float = 1.0, seed: in
             motion=motion,
             stamp_ns=round(1e9 * stamp_s),
         )
-        sweeps.append(measured)
+        sweeps.append(frame)
     return sweeps[0], sweeps[1]
 
 
@@ -45,13 +45,13 @@ def of_lidar(motion: EgoMotion) -> Doubles:
 
 
 @pytest.mark.parametrize(("speed_mps", "turn_radps"), [(8.0, 0.3), (0.0, 0.0)])
-def test_the_motion_between_two_sweeps_is_found(speed_mps: float, turn_radps: float) -> None:
-    """Velocities that carry the vehicle further than a registration leads are found from one that is near."""
+def test_the_motion_between_two_sweeps_is_measured(speed_mps: float, turn_radps: float) -> None:
+    """Velocities that carry the vehicle further than a registration leads are measured from one that is near."""
     moved = ego(speed_mps, turn_radps)
-    (found,) = motions_of_sweeps([consecutive(room, moved)], None, nearest_neighbours.Trees())
-    assert found is not None
-    assert found.linear_mps is not None
-    twist = np.array([*found.angular_radps, *found.linear_mps])
+    (measured,) = motions_of_sweeps([consecutive(room, moved)], None, nearest_neighbours.Trees())
+    assert measured is not None
+    assert measured.linear_mps is not None
+    twist = np.array([*measured.angular_radps, *measured.linear_mps])
     np.testing.assert_allclose(twist[:3], of_lidar(moved)[:3], atol=np.deg2rad(2.0))
     np.testing.assert_allclose(twist[3:], of_lidar(moved)[3:], atol=0.2)
 
@@ -59,17 +59,17 @@ def test_the_motion_between_two_sweeps_is_found(speed_mps: float, turn_radps: fl
 def test_a_velocity_is_followed_from_pair_to_pair() -> None:
     moved = ego(-18.0, 0.0)
     pairs = [consecutive(room, moved, seed=seed) for seed in (1, 2)]
-    for found in motions_of_sweeps(pairs, None, nearest_neighbours.Trees()):
-        assert found is not None
-        assert found.speed_mps == pytest.approx(18.0, abs=0.2)
+    for measured in motions_of_sweeps(pairs, None, nearest_neighbours.Trees()):
+        assert measured is not None
+        assert measured.speed_mps == pytest.approx(18.0, abs=0.2)
 
 
 @pytest.mark.fault("odometry is missing, and the LiDAR drives along a corridor", "the velocity stays unknown")
 def test_along_a_corridor_the_turn_alone_is_known() -> None:
-    (found,) = motions_of_sweeps([consecutive(corridor, ego(5.0, 0.2))], None, nearest_neighbours.Trees())
-    assert found is not None
-    assert found.linear_mps is None
-    np.testing.assert_allclose(found.angular_radps, of_lidar(ego(5.0, 0.2))[:3], atol=np.deg2rad(3.0))
+    (measured,) = motions_of_sweeps([consecutive(corridor, ego(5.0, 0.2))], None, nearest_neighbours.Trees())
+    assert measured is not None
+    assert measured.linear_mps is None
+    np.testing.assert_allclose(measured.angular_radps, of_lidar(ego(5.0, 0.2))[:3], atol=np.deg2rad(3.0))
 
 
 def test_sweeps_that_are_not_consecutive_show_no_motion() -> None:

@@ -39,7 +39,7 @@ def test_a_recorded_motion_is_not_measured_again() -> None:
     assert not {one.code for one in loaded(DRIVE).recognitions} & {"motion_registered", "motion_unknown"}
 
 
-def test_without_the_extra_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_the_report_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(nearest_neighbours, "installed", lambda: False)
     window = loaded(WITHOUT)
     (note,) = window.recognitions
@@ -48,6 +48,6 @@ def test_without_the_extra_it_is_said_what_to_install(monkeypatch: pytest.Monkey
     assert all(pair.motion is None for pair in window.window.pairs)
 
 
-def test_frames_seconds_apart_show_no_motion() -> None:
-    apart = "sim:seed=3&seconds=4&camera_hz=0.5&lidar_hz=0.5&camera=fisheye320&lidar=32&faults=no-ego:0-9"
-    assert loaded(apart).recognitions == ()
+def test_frames_in_two_second_steps_show_no_motion() -> None:
+    distant = "sim:seed=3&seconds=4&camera_hz=0.5&lidar_hz=0.5&camera=fisheye320&lidar=32&faults=no-ego:0-9"
+    assert loaded(distant).recognitions == ()

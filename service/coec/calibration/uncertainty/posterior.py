@@ -405,16 +405,20 @@ ONE_PARAMETER: Mapping[str, tuple[int, tuple[float, ...]]] = MappingProxyType(
 """By the name of a hypothesis with one parameter of the lens: its place, and values at which ascents may begin."""
 
 
-def _led_along(
+def _ascent_along(
     levels: Sequence[AssumedEdges], name: str, places: tuple[int, ...], prior: Vector, share: float
 ) -> Ascent | None:
     """Where an ascent ends from the value of a single parameter of the lens that is the most significant one on the
-    coarsest edges; None if that is the value that was assumed, or if the hypothesis has more parameters."""
+    coarsest edges; None if that is the value that was assumed, if it leads to no lens, or if the hypothesis has more
+    parameters."""
     if name not in ONE_PARAMETER:
         return None
     place, values = ONE_PARAMETER[name]
     begin = _best_with_turns(levels[0], np.array(values)[:, None] * np.eye(3)[place])
-    return ascent(levels, begin, places, prior, share) if begin.any() else None
+    if not begin.any():
+        return None
+    end = ascent(levels, begin, places, prior, share)
+    return end if _of_a_lens(end, prior) else None
 
 
 def _of_a_lens(end: Ascent, prior: Vector) -> bool:
@@ -523,10 +527,10 @@ def _alternative(
     share = nominal.independent_share
     admissible = np.abs(general.deviation) <= ADMISSIBLE * prior
     end = ascent(levels[-1:], np.where(admissible, general.deviation, 0.0), places, prior, share)
-    led = _led_along(levels, name, places, prior, share)
+    along = _ascent_along(levels, name, places, prior, share)
     off = (nominal.mean / prior)[list(places)]
     there = 0.5 * share * nominal.significance**2 - 0.5 * float(np.sum(off * off))
-    ends = (end, Ascent(nominal.mean, nominal.significance, there), *(() if led is None else (led,)))
+    ends = (end, Ascent(nominal.mean, nominal.significance, there), *(() if along is None else (along,)))
     top = max(ends, key=lambda place: place.log_posterior)
     # A place that is much higher is on another hill, of another width.
     same_hill = top.log_posterior - there <= AS_GOOD
