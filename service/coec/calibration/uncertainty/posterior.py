@@ -359,7 +359,7 @@ def _general_optimum(levels: Sequence[AssumedEdges], places: tuple[int, ...], pr
     prior = np.max(list(priors.values()), axis=0)
     turning = (*TURNS, *LENS[:3])
     begins = [
-        _best_with_turns(levels[0], np.array([(right, down, longer) for right, down in product(OFFSETS, OFFSETS)]))
+        _best_with_turns(levels[0], np.array([(*offset, longer) for offset in product(OFFSETS, OFFSETS)]), (1.0,))
         for longer in ZOOMS
     ]
     ascended = [ascent(levels[:1], begin, turning, prior, GENERAL_SHARE) for begin in begins]
@@ -375,23 +375,22 @@ def _general_optimum(levels: Sequence[AssumedEdges], places: tuple[int, ...], pr
     return general if _of_a_lens(general, prior) else best
 
 
-MADE_UP = (1.0, 1.25, 1.5)
-"""Shares of the turn that makes up for a lens in the mean of the edges. Through a wide lens a pose may have made up for
-it in the middle of the image, where a pixel is a larger angle. See docs/measured.md."""
-
-
-def _best_with_turns(coarse: AssumedEdges, lenses: NDArray[np.float64]) -> Vector:
-    """(13,) the most significant of some lenses (K, 3), principal point and focal length, each with a turn that makes
-    up for it."""
+def _best_with_turns(coarse: AssumedEdges, lenses: NDArray[np.float64], shares: Sequence[float]) -> Vector:
+    """(13,) the most significant of some lenses (K, 3), principal point and focal length, each with these shares of the
+    turn that makes up for it in the mean of the edges."""
     turning, best = (*TURNS, *LENS[:3]), np.zeros(SIZE)
     edges = coarse.at(best, turning)
     of_edges = metric(edges)
     answer = linalg.product(linalg.inverse(of_edges[:3, :3]), of_edges[:3, 3:])
     turns = -linalg.product(lenses, answer.T)
-    starts = np.concatenate([np.concatenate([share * turns, lenses], axis=1) for share in MADE_UP])
+    starts = np.concatenate([np.concatenate([share * turns, lenses], axis=1) for share in shares])
     best[list(turning)] = starts[np.argmax(edges.significances(starts))]
     return best
 
+
+MADE_UP = (1.0, 1.25, 1.5)
+"""Shares of the turn that makes up for a lens in the mean of the edges. Through a wide lens a pose may have made up for
+it in the middle of the image, where a pixel is a larger angle. See docs/measured.md."""
 
 FINE_OFFSETS = (*OFFSETS, -0.075, -0.025, 0.025, 0.075)
 
@@ -414,7 +413,7 @@ def _ascent_along(
     if name not in ONE_PARAMETER:
         return None
     place, values = ONE_PARAMETER[name]
-    begin = _best_with_turns(levels[0], np.array(values)[:, None] * np.eye(3)[place])
+    begin = _best_with_turns(levels[0], np.array(values)[:, None] * np.eye(3)[place], MADE_UP)
     if not begin.any():
         return None
     end = ascent(levels, begin, places, prior, share)
