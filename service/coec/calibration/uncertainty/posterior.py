@@ -430,7 +430,7 @@ SAME_MODE = 3.0
 
 ADMISSIBLE = 4.0
 """A hypothesis is also tried about the general optimum, as far as that is within so many standard deviations of its
-prior."""
+prior; and another mode has to be, as a whole."""
 
 NEGLIGIBLE = 3e-3
 """A hypothesis that is at most this probable, by an upper bound, is taken at the bound: it adds a twentieth of its
@@ -473,7 +473,8 @@ def _other_mode(
     least, modes = nominal.log_posterior + log(NEGLIGIBLE), []
     for start, leading in ((np.zeros(SIZE), levels[-1:]), (of_general, levels[-2:])):
         end = ascent(leading, start, places, prior, share)
-        if end.log_posterior < least or not _is_away(end.deviation, nominal.mean, sigma):
+        contradicted = bool((np.abs(end.deviation) > ADMISSIBLE * prior).any())
+        if contradicted or end.log_posterior < least or not _is_away(end.deviation, nominal.mean, sigma):
             continue
         mode = fit_gaussian(levels[-1], end.deviation, places, prior, share, effort=ROUGH, share_is_known=True)
         if _is_away(mode.mean, nominal.mean, sigma):
