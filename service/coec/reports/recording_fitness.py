@@ -376,7 +376,11 @@ def _not_finite(sweep: types.LidarFrame) -> float:
 
 def _motion(seen: Fitness) -> Notice | None:
     if seen.motion is None:
-        return Notice("warn", "no_ego_motion", "No ego-motion: sweeps taken while driving cannot be compensated.")
+        text = (
+            "No ego-motion is recorded. A calibration measures it where sweeps with times of points follow each other "
+            "within 0.3 s (extra `lidars`); other sweeps taken while driving are not compensated."
+        )
+        return Notice("warn", "no_ego_motion", text)
     if seen.paired > 0.0 and seen.with_motion < MOSTLY:
         text = (
             f"{1 - seen.with_motion:.0%} of the pairs have no ego-motion within "
