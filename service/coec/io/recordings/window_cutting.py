@@ -168,8 +168,8 @@ def _with_motion(
     timed = all(pair.lidar.time_offset_s is not None and np.ptp(pair.lidar.time_offset_s) > 0.0 for pair in pairs)
     neighbours = [_neighbour(stamps_ns, pair.lidar.stamp_ns) for pair in pairs]
     known = [stamp_ns for stamp_ns in neighbours if stamp_ns is not None]
-    unknown = recording.motion_stamps_ns or not known or not (timed or rig.sweep)
-    if unknown or evidence.stands([pair.lidar for pair in pairs]):
+    measurable = known and (timed or rig.sweep) and not recording.motion_stamps_ns
+    if not measurable or evidence.stands([pair.lidar for pair in pairs]):
         return rig, pairs, ()
     if not nearest_neighbours.installed():
         text = (
