@@ -223,8 +223,8 @@ class SimulatedDrive:
 
     def messages(self, cameras: Collection[int] | None = None) -> Iterator[Frame]:
         """See `Recording.messages`."""
-        for entry in self._plan if cameras is None else needed(self._plan, cameras, _CAMERA, _LIDAR, _EGO):
-            yield self._message(entry)
+        required = self._plan if cameras is None else needed(self._plan, cameras, _CAMERA, _LIDAR, _EGO)
+        return map(self._message, required)
 
     def sweeps(self, stamps_ns: Collection[int]) -> Iterator[LidarFrame]:
         """See `Recording.sweeps`."""

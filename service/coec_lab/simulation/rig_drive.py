@@ -354,12 +354,8 @@ class SimulatedRigPair:
 
     def messages(self, cameras: Collection[int] | None = None) -> Iterator[Frame]:
         """See `Recording.messages`."""
-        of = self._drive.stream
-        entries = self._plan
-        if cameras is not None:
-            entries = list(needed(entries, cameras, of(self._camera), of(self._lidar), of(EGO)))
-        for entry in entries:
-            yield self._drive.message(entry)
+        streams = (self._drive.stream(name) for name in (self._camera, self._lidar, EGO))
+        return map(self._drive.message, self._plan if cameras is None else needed(self._plan, cameras, *streams))
 
     def sweeps(self, stamps_ns: Collection[int]) -> Iterator[LidarFrame]:
         """See `Recording.sweeps`."""
