@@ -358,10 +358,8 @@ def _general_optimum(levels: Sequence[AssumedEdges], places: tuple[int, ...], pr
     """The most significant deviation with every parameter free, whatever the lens that was assumed."""
     prior = np.max(list(priors.values()), axis=0)
     turning = (*TURNS, *LENS[:3])
-    begins = [
-        _best_with_turns(levels[0], np.array([(*offset, longer) for offset in product(OFFSETS, OFFSETS)]), (1.0,))
-        for longer in ZOOMS
-    ]
+    lenses = [np.array([(*offset, longer) for offset in product(OFFSETS, OFFSETS)]) for longer in ZOOMS]
+    begins = _best_with_turns(levels[0], lenses, (1.0,))
     ascended = [ascent(levels[:1], begin, turning, prior, GENERAL_SHARE) for begin in begins]
     ascended = sorted((end for end in ascended if _of_a_lens(end, prior)), key=lambda end: -end.significance)
     leading, begins = (*TURNS, *SHIFTS, *LENS[:3]), [np.zeros(SIZE), *(end.deviation for end in ascended[:ASCENTS])]
@@ -375,17 +373,21 @@ def _general_optimum(levels: Sequence[AssumedEdges], places: tuple[int, ...], pr
     return general if _of_a_lens(general, prior) else best
 
 
-def _best_with_turns(coarse: AssumedEdges, lenses: NDArray[np.float64], shares: Sequence[float]) -> Vector:
-    """(13,) the most significant of some lenses (K, 3), principal point and focal length, each with these shares of the
-    turn that makes up for it in the mean of the edges."""
-    turning, best = (*TURNS, *LENS[:3]), np.zeros(SIZE)
-    edges = coarse.at(best, turning)
+def _best_with_turns(
+    coarse: AssumedEdges, groups: Sequence[NDArray[np.float64]], shares: Sequence[float]
+) -> list[Vector]:
+    """(13,) for each group of lenses (K, 3), principal point and focal length, the most significant one with one of
+    these shares of the turn that makes up for it in the mean of the edges."""
+    turning, begins = (*TURNS, *LENS[:3]), []
+    edges = coarse.at(np.zeros(SIZE), turning)
     of_edges = metric(edges)
     answer = linalg.product(linalg.inverse(of_edges[:3, :3]), of_edges[:3, 3:])
-    turns = -linalg.product(lenses, answer.T)
-    starts = np.concatenate([np.concatenate([share * turns, lenses], axis=1) for share in shares])
-    best[list(turning)] = starts[np.argmax(edges.significances(starts))]
-    return best
+    for lenses in groups:
+        turns, best = -linalg.product(lenses, answer.T), np.zeros(SIZE)
+        starts = np.concatenate([np.concatenate([share * turns, lenses], axis=1) for share in shares])
+        best[list(turning)] = starts[np.argmax(edges.significances(starts))]
+        begins.append(best)
+    return begins
 
 
 MADE_UP = (1.0, 1.25, 1.5)
@@ -413,7 +415,7 @@ def _ascent_along(
     if name not in ONE_PARAMETER:
         return None
     place, values = ONE_PARAMETER[name]
-    begin = _best_with_turns(levels[0], np.array(values)[:, None] * np.eye(3)[place], MADE_UP)
+    (begin,) = _best_with_turns(levels[0], [np.array(values)[:, None] * np.eye(3)[place]], MADE_UP)
     if not begin.any():
         return None
     end = ascent(levels, begin, places, prior, share)
