@@ -32,11 +32,12 @@ def poisoned(tmp_path: Path) -> Iterator[str]:
 
     def kill() -> None:
         while not stop.is_set():
-            with path.open("wb"):  # returns when somebody reads
-                if not stop.is_set():
-                    for child in psutil.Process().children(recursive=True):
-                        if _reads(child, path):
-                            child.kill()
+            with path.open("wb"):  # returns when somebody reads, which may be before the reader's descriptor is listed
+                readers: list[psutil.Process] = []
+                while not (readers or stop.is_set()):
+                    readers = [child for child in psutil.Process().children(recursive=True) if _reads(child, path)]
+                for reader in readers:
+                    reader.kill()
 
     thread = threading.Thread(target=kill, daemon=True)
     thread.start()
