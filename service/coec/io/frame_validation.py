@@ -2,11 +2,12 @@
 
 import math
 from enum import StrEnum
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.types import LidarFrame
+from coec.calibration.types import EncodedImage, ImageFormat, LidarFrame
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
 
@@ -19,6 +20,28 @@ timed by another clock."""
 
 MAX_SPEED = 1000.0
 """Largest velocity, m/s and rad/s, beyond every vehicle and gyroscope (as in coec.schemas.frames)."""
+
+
+SUBSAMPLED: Final = (ImageFormat.YUV422, ImageFormat.YUV422_YUY2)
+"""Formats in which two pixels of a row share their colour."""
+
+MOSAICS: Final = tuple(form for form in ImageFormat if form.startswith("bayer_"))
+"""Formats in which each pixel has one colour."""
+
+_MOSAIC_PX = 4
+"""Least side of a mosaic: two pixels of each colour, so that colours can be interpolated between them."""
+
+BYTES_PER_PIXEL: Final = {
+    ImageFormat.MONO8: 1,
+    ImageFormat.MONO16: 2,
+    ImageFormat.RGB8: 3,
+    ImageFormat.BGR8: 3,
+    ImageFormat.RGBA8: 4,
+    ImageFormat.BGRA8: 4,
+    **{form: 2 if form.endswith("16") else 1 for form in MOSAICS},
+    **dict.fromkeys(SUBSAMPLED, 2),
+}
+"""Bytes per pixel of every raw format; 16-bit values are little-endian."""
 
 
 class Refusal(StrEnum):
@@ -57,6 +80,39 @@ def check_size(payload: bytes, limits: LimitsConfig) -> None:
         raise DecodeError(
             Refusal.MESSAGE_TOO_LARGE,
             f"{len(payload)} bytes; limits.max_message_bytes is {limits.max_message_bytes}",
+        )
+
+
+def raw_image(form: ImageFormat, width: int, height: int, data: bytes, limits: LimitsConfig) -> EncodedImage:
+    """Rows of raw pixels without padding, `height × width × BYTES_PER_PIXEL` bytes.
+
+    Raises:
+        DecodeError: `image_too_large` or `image_size_mismatch`.
+    """
+    check_image_size(width, height, limits)
+    if (form in SUBSAMPLED and width % 2) or (form in MOSAICS and min(width, height) < _MOSAIC_PX):
+        raise DecodeError(Refusal.IMAGE_SIZE_MISMATCH, f"{form} pixels come in pairs, not as {width}×{height}")
+    expected = width * height * BYTES_PER_PIXEL[form]
+    if len(data) != expected:
+        raise DecodeError(
+            Refusal.IMAGE_SIZE_MISMATCH,
+            f"{width}×{height} {form} pixels are {expected} bytes, not {len(data)}",
+        )
+    return EncodedImage(format=form, width=width, height=height, data=data)
+
+
+def check_image_size(width: int, height: int, limits: LimitsConfig) -> None:
+    """Checks the size of an image before anything of it is allocated.
+
+    Raises:
+        DecodeError: `image_corrupt` without pixels, `image_too_large`.
+    """
+    if width < 1 or height < 1:
+        raise DecodeError(Refusal.IMAGE_CORRUPT, f"the image claims to be {width}×{height} pixels")
+    if width * height > limits.max_image_pixels:
+        raise DecodeError(
+            Refusal.IMAGE_TOO_LARGE,
+            f"the image claims {width}×{height} pixels; limits.max_image_pixels is {limits.max_image_pixels}",
         )
 
 

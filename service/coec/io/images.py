@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from coec.calibration.types import CameraFrame, EncodedImage, ImageFormat, ImageQuality
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
-from coec.io.frame_validation import Refusal
+from coec.io.frame_validation import BYTES_PER_PIXEL, SUBSAMPLED, Refusal, check_image_size, raw_image
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_HEADER = 33  # bytes: signature and IHDR
@@ -195,10 +195,9 @@ _LUMA: Final = np.clip(np.rint((np.arange(256) - _BLACK) * (255 / (_WHITE - _BLA
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """Layout of one format: `channels` of `dtype` per pixel; OpenCV's conversions, None if nothing is to convert."""
+    """Layout of one format: type of a channel; OpenCV's conversions, None if nothing is to convert."""
 
     dtype: np.dtype[Any]
-    channels: int
     to_bgr: int | None
     to_grey: int | None
 
@@ -206,33 +205,24 @@ class _Layout:
 _U8, _U16 = np.dtype("u1"), np.dtype("<u2")
 
 _LAYOUTS: Final[dict[ImageFormat, _Layout]] = {
-    ImageFormat.MONO8: _Layout(_U8, 1, cv2.COLOR_GRAY2BGR, None),
-    ImageFormat.MONO16: _Layout(_U16, 1, cv2.COLOR_GRAY2BGR, None),
-    ImageFormat.RGB8: _Layout(_U8, 3, cv2.COLOR_RGB2BGR, cv2.COLOR_RGB2GRAY),
-    ImageFormat.BGR8: _Layout(_U8, 3, None, cv2.COLOR_BGR2GRAY),
-    ImageFormat.RGBA8: _Layout(_U8, 4, cv2.COLOR_RGBA2BGR, cv2.COLOR_RGBA2GRAY),
-    ImageFormat.BGRA8: _Layout(_U8, 4, cv2.COLOR_BGRA2BGR, cv2.COLOR_BGRA2GRAY),
+    ImageFormat.MONO8: _Layout(_U8, cv2.COLOR_GRAY2BGR, None),
+    ImageFormat.MONO16: _Layout(_U16, cv2.COLOR_GRAY2BGR, None),
+    ImageFormat.RGB8: _Layout(_U8, cv2.COLOR_RGB2BGR, cv2.COLOR_RGB2GRAY),
+    ImageFormat.BGR8: _Layout(_U8, None, cv2.COLOR_BGR2GRAY),
+    ImageFormat.RGBA8: _Layout(_U8, cv2.COLOR_RGBA2BGR, cv2.COLOR_RGBA2GRAY),
+    ImageFormat.BGRA8: _Layout(_U8, cv2.COLOR_BGRA2BGR, cv2.COLOR_BGRA2GRAY),
     # Named by the first four pixels, as ROS does; OpenCV's older names (BayerBG for RGGB) begin elsewhere.
-    ImageFormat.BAYER_RGGB8: _Layout(_U8, 1, cv2.COLOR_BayerRGGB2BGR, cv2.COLOR_BayerRGGB2GRAY),
-    ImageFormat.BAYER_BGGR8: _Layout(_U8, 1, cv2.COLOR_BayerBGGR2BGR, cv2.COLOR_BayerBGGR2GRAY),
-    ImageFormat.BAYER_GBRG8: _Layout(_U8, 1, cv2.COLOR_BayerGBRG2BGR, cv2.COLOR_BayerGBRG2GRAY),
-    ImageFormat.BAYER_GRBG8: _Layout(_U8, 1, cv2.COLOR_BayerGRBG2BGR, cv2.COLOR_BayerGRBG2GRAY),
-    ImageFormat.BAYER_RGGB16: _Layout(_U16, 1, cv2.COLOR_BayerRGGB2BGR, cv2.COLOR_BayerRGGB2GRAY),
-    ImageFormat.BAYER_BGGR16: _Layout(_U16, 1, cv2.COLOR_BayerBGGR2BGR, cv2.COLOR_BayerBGGR2GRAY),
-    ImageFormat.BAYER_GBRG16: _Layout(_U16, 1, cv2.COLOR_BayerGBRG2BGR, cv2.COLOR_BayerGBRG2GRAY),
-    ImageFormat.BAYER_GRBG16: _Layout(_U16, 1, cv2.COLOR_BayerGRBG2BGR, cv2.COLOR_BayerGRBG2GRAY),
-    ImageFormat.YUV422: _Layout(_U8, 2, cv2.COLOR_YUV2BGR_UYVY, cv2.COLOR_YUV2GRAY_UYVY),
-    ImageFormat.YUV422_YUY2: _Layout(_U8, 2, cv2.COLOR_YUV2BGR_YUY2, cv2.COLOR_YUV2GRAY_YUY2),
+    ImageFormat.BAYER_RGGB8: _Layout(_U8, cv2.COLOR_BayerRGGB2BGR, cv2.COLOR_BayerRGGB2GRAY),
+    ImageFormat.BAYER_BGGR8: _Layout(_U8, cv2.COLOR_BayerBGGR2BGR, cv2.COLOR_BayerBGGR2GRAY),
+    ImageFormat.BAYER_GBRG8: _Layout(_U8, cv2.COLOR_BayerGBRG2BGR, cv2.COLOR_BayerGBRG2GRAY),
+    ImageFormat.BAYER_GRBG8: _Layout(_U8, cv2.COLOR_BayerGRBG2BGR, cv2.COLOR_BayerGRBG2GRAY),
+    ImageFormat.BAYER_RGGB16: _Layout(_U16, cv2.COLOR_BayerRGGB2BGR, cv2.COLOR_BayerRGGB2GRAY),
+    ImageFormat.BAYER_BGGR16: _Layout(_U16, cv2.COLOR_BayerBGGR2BGR, cv2.COLOR_BayerBGGR2GRAY),
+    ImageFormat.BAYER_GBRG16: _Layout(_U16, cv2.COLOR_BayerGBRG2BGR, cv2.COLOR_BayerGBRG2GRAY),
+    ImageFormat.BAYER_GRBG16: _Layout(_U16, cv2.COLOR_BayerGRBG2BGR, cv2.COLOR_BayerGRBG2GRAY),
+    ImageFormat.YUV422: _Layout(_U8, cv2.COLOR_YUV2BGR_UYVY, cv2.COLOR_YUV2GRAY_UYVY),
+    ImageFormat.YUV422_YUY2: _Layout(_U8, cv2.COLOR_YUV2BGR_YUY2, cv2.COLOR_YUV2GRAY_YUY2),
 }
-
-SUBSAMPLED: Final = (ImageFormat.YUV422, ImageFormat.YUV422_YUY2)
-"""Formats in which two pixels of a row share their colour."""
-
-MOSAICS: Final = tuple(form for form in ImageFormat if form.startswith("bayer_"))
-"""Formats in which each pixel has one colour."""
-
-BYTES_PER_PIXEL: Final = {form: layout.channels * layout.dtype.itemsize for form, layout in _LAYOUTS.items()}
-"""Bytes per pixel of every raw format; 16-bit values are little-endian."""
 
 
 def bgr_of(image: EncodedImage) -> NDArray[np.uint8]:
@@ -281,12 +271,10 @@ def eight_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
 
 def _pixels(image: EncodedImage) -> NDArray[np.uint8]:
     layout = _LAYOUTS[image.format]
-    shape = (image.height, image.width) + ((layout.channels,) if layout.channels > 1 else ())
+    channels = BYTES_PER_PIXEL[image.format] // layout.dtype.itemsize
+    shape = (image.height, image.width) + ((channels,) if channels > 1 else ())
     return eight_bits(np.frombuffer(image.data, layout.dtype).reshape(shape))
 
-
-_MOSAIC_PX = 4
-"""Least side of a mosaic: two pixels of each colour, so that colours can be interpolated between them."""
 
 _REDUCE_FROM_PX = 64
 """Smaller images are judged at full size, because at half size too few gradients would be left for a mean."""
@@ -302,42 +290,9 @@ def probe(data: bytes, limits: LimitsConfig) -> EncodedImage:
         DecodeError: `image_unknown_format`, `image_truncated`, `image_too_large` or `image_corrupt`.
     """
     header = read_header(data)
-    check_size(header.width, header.height, limits)
+    check_image_size(header.width, header.height, limits)
     check_body(header, data)
     return EncodedImage(format=header.format, width=header.width, height=header.height, data=data)
-
-
-def raw_image(form: ImageFormat, width: int, height: int, data: bytes, limits: LimitsConfig) -> EncodedImage:
-    """Rows of raw pixels without padding, `height × width × BYTES_PER_PIXEL` bytes.
-
-    Raises:
-        DecodeError: `image_too_large` or `image_size_mismatch`.
-    """
-    check_size(width, height, limits)
-    if (form in SUBSAMPLED and width % 2) or (form in MOSAICS and min(width, height) < _MOSAIC_PX):
-        raise DecodeError(Refusal.IMAGE_SIZE_MISMATCH, f"{form} pixels come in pairs, not as {width}×{height}")
-    expected = width * height * BYTES_PER_PIXEL[form]
-    if len(data) != expected:
-        raise DecodeError(
-            Refusal.IMAGE_SIZE_MISMATCH,
-            f"{width}×{height} {form} pixels are {expected} bytes, not {len(data)}",
-        )
-    return EncodedImage(format=form, width=width, height=height, data=data)
-
-
-def check_size(width: int, height: int, limits: LimitsConfig) -> None:
-    """Checks the size of an image before anything of it is allocated.
-
-    Raises:
-        DecodeError: `image_corrupt` without pixels, `image_too_large`.
-    """
-    if width < 1 or height < 1:
-        raise DecodeError(Refusal.IMAGE_CORRUPT, f"the image claims to be {width}×{height} pixels")
-    if width * height > limits.max_image_pixels:
-        raise DecodeError(
-            Refusal.IMAGE_TOO_LARGE,
-            f"the image claims {width}×{height} pixels; limits.max_image_pixels is {limits.max_image_pixels}",
-        )
 
 
 # --- pixels -------------------------------------------------------------------------------------------------

@@ -11,8 +11,8 @@ from pydantic import ValidationError
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, Frame, ImageFormat, LidarFrame
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
-from coec.io.frame_validation import Refusal, check_size, lidar_frame
-from coec.io.images import probe, raw_image
+from coec.io.frame_validation import Refusal, check_size, lidar_frame, raw_image
+from coec.io.images import probe
 from coec.schemas import frames
 from coec.schemas.message import Message, to_msgpack
 

@@ -21,8 +21,7 @@ from typing import Any, Final
 from coec.calibration.types import EncodedImage, ImageFormat
 from coec.config import LimitsConfig
 from coec.errors import DecodeError, SourceError
-from coec.io.frame_validation import Refusal
-from coec.io.images import raw_image
+from coec.io.frame_validation import Refusal, raw_image
 
 MAX_PIXELS: Final = 4096 * 4096
 """Largest picture of a video. A decoder keeps up to 17 of them, of 1.5 bytes a pixel: 430 MB."""

@@ -21,8 +21,8 @@ from coec.geometry.edges.range_edges import range_edges
 from coec.geometry.edges.scan_lines import scan_lines
 from coec.geometry.points import thinned
 from coec.geometry.projection import points_in_view
-from coec.io.frame_validation import Refusal
-from coec.io.images import BYTES_PER_PIXEL, NEAREST_M, WHOLE_SCALE, decode_bgr, encode_jpeg
+from coec.io.frame_validation import BYTES_PER_PIXEL, Refusal
+from coec.io.images import NEAREST_M, WHOLE_SCALE, decode_bgr, encode_jpeg
 from coec.io.ros.message_encoding import DISTORTION, UnsupportedCameraError, ros_camera
 
 NOT_SERVED = "not_served"

@@ -34,7 +34,7 @@ from coec.config import (
 )
 from coec.errors import ConfigError, SourceError
 from coec.geometry.se3 import difference
-from coec.io.images import BYTES_PER_PIXEL
+from coec.io.frame_validation import BYTES_PER_PIXEL
 from coec.io.rig_files import matrix_rows, rig_of
 from coec.io.ros.camera_info import CameraInfoContent, info_topic, intrinsics_of_info, is_rectified
 from coec.io.ros.messages import IMAGE

@@ -24,7 +24,8 @@ from coec.geometry import cameras, se3
 from coec.geometry.points import random_direction
 from coec.geometry.sweep_kernels import bearings
 from coec.io.depth.depth_maps import CachedDepth, open_depth
-from coec.io.images import GreyImages, decode_bgr, decode_depth, encode_depth_png, raw_image
+from coec.io.frame_validation import raw_image
+from coec.io.images import GreyImages, decode_bgr, decode_depth, encode_depth_png
 from coec.io.recordings.window_cutting import load_window
 from coec_lab.experiments.evaluation_run import Plan, configuration_of
 from coec_lab.experiments.solve_experiments import start_poses

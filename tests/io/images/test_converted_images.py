@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from coec.calibration.types import CameraFrame, EncodedImage, ImageFormat
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
-from coec.io.images import decode_bgr, decode_grey, is_order_swapped, raw_image
+from coec.io.frame_validation import raw_image
+from coec.io.images import decode_bgr, decode_grey, is_order_swapped
 from coec.io.ros import message_decoding, messages
 from coec.io.ros.message_decoding import from_file
 from support.ros import compressed_image

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from coec.calibration.types import CameraFrame, EncodedImage, ImageFormat
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
+from coec.io.frame_validation import raw_image
 from coec.io.images import (
     Inspector,
     decode_bgr,
@@ -25,7 +26,6 @@ from coec.io.images import (
     encode_jpeg,
     encode_png,
     probe,
-    raw_image,
 )
 
 LIMITS = LimitsConfig()

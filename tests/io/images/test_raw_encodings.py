@@ -7,9 +7,8 @@ from numpy.typing import NDArray
 from coec.calibration.types import CameraFrame, EncodedImage, ImageFormat
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
+from coec.io.frame_validation import BYTES_PER_PIXEL, MOSAICS, raw_image
 from coec.io.images import (
-    BYTES_PER_PIXEL,
-    MOSAICS,
     CompressingReducer,
     Inspector,
     decode_bgr,
@@ -18,7 +17,6 @@ from coec.io.images import (
     encode_depth_png,
     encode_jpeg,
     probe,
-    raw_image,
 )
 from coec.io.images import decode_grey as grey_of
 

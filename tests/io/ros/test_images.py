@@ -6,7 +6,8 @@ import pytest
 from coec.calibration.types import CameraFrame, EncodedImage, ImageFormat
 from coec.config import LimitsConfig
 from coec.errors import DecodeError
-from coec.io.images import BYTES_PER_PIXEL, encode_png
+from coec.io.frame_validation import BYTES_PER_PIXEL
+from coec.io.images import encode_png
 from coec.io.ros import message_decoding, message_encoding, messages
 from coec.io.ros.message_decoding import ENCODINGS
 from coec.schemas import frames

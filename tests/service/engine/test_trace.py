@@ -14,7 +14,7 @@ from coec.io.zenoh.bus import MSGPACK, InputSample
 from coec.service.ingest.decoder import CAMERA, EGO, LIDAR
 from support.vehicles import BEGIN_S, NS_PER_S, PairBench, frame_pair_at
 
-MOST_FILES, MOST_MOVES = 15, 60
+MOST_FILES, MOST_MOVES = 14, 60
 
 PACKAGE = str(Path(coec.__file__).parent)
 

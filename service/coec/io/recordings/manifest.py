@@ -32,7 +32,8 @@ from coec.config.pair import Pose, with_direction
 from coec.errors import ConfigError, DecodeError, OutputError, SourceError, UsageError
 from coec.geometry import cameras, se3
 from coec.geometry.cameras import Camera
-from coec.io.images import encode_depth_png, probe, raw_image
+from coec.io.frame_validation import raw_image
+from coec.io.images import encode_depth_png, probe
 from coec.io.intrinsics_files import cameras_of, load_camera_document, with_camera
 from coec.io.numpy_files import read_npy
 from coec.io.recordings import bag_recognition, recording_source

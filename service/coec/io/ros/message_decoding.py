@@ -23,9 +23,8 @@ from rosbags.typesys.stores.ros2_humble import sensor_msgs__msg__Image as Image
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, Frame, ImageFormat, LidarFrame
 from coec.config import LimitsConfig, PointTimeConfig
 from coec.errors import DecodeError
-from coec.io import images
-from coec.io.frame_validation import MAX_SPEED, Refusal, check_size
-from coec.io.images import BYTES_PER_PIXEL, eight_bits, probe, raw_image
+from coec.io.frame_validation import BYTES_PER_PIXEL, MAX_SPEED, Refusal, check_image_size, check_size, raw_image
+from coec.io.images import eight_bits, probe
 from coec.io.ros import messages, packed_clouds, point_clouds
 from coec.io.ros.messages import check_cloud_fields, check_header, deserialized, frame_id, stamp_ns
 
@@ -72,7 +71,7 @@ def from_semiplanar(
     Raises:
         DecodeError: `image_too_large`, `image_size_mismatch`.
     """
-    images.check_size(width, height, limits)
+    check_image_size(width, height, limits)
     if width % 2 or height % 2:
         raise DecodeError(Refusal.IMAGE_SIZE_MISMATCH, f"{encoding} has even sides, not {width}×{height}")
     planes = rows_of(data, height + height // 2, width, step)
@@ -92,7 +91,7 @@ def from_deep_colours(
     Raises:
         DecodeError: `image_too_large`, `image_size_mismatch`.
     """
-    images.check_size(width, height, limits)
+    check_image_size(width, height, limits)
     channels, form = DEEP_COLOURS[encoding]
     rows = np.ascontiguousarray(rows_of(data, height, 2 * channels * width, step))
     return raw_image(form, width, height, eight_bits(rows.view(">u2" if big else "<u2")).tobytes(), limits)
@@ -107,7 +106,7 @@ def from_file(data: bytes, limits: LimitsConfig) -> EncodedImage | None:
     size = _size_of(data)
     if size is None:
         return None
-    images.check_size(*size, limits)
+    check_image_size(*size, limits)
     try:
         mode = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
         decoded: Any = cv2.imdecode(np.frombuffer(data, np.uint8), mode)

@@ -18,7 +18,7 @@ from coec.geometry.cameras import MODELS, Camera, intrinsics_of, name_of, unproj
 from coec.geometry.cameras.base import CommonIntrinsics
 from coec.geometry.cameras.kannala_brandt import fit_kannala_brandt
 from coec.geometry.se3 import quaternion_xyzw_from_rotation
-from coec.io.images import BYTES_PER_PIXEL
+from coec.io.frame_validation import BYTES_PER_PIXEL
 from coec.io.ros import messages, point_clouds
 from coec.schemas import replies
 from coec.schemas.keys import sensor_status_name, status_name
