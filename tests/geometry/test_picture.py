@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from coec.geometry.images import level_counts, neighbour_differences, square_sums
+from coec.geometry.images import connected_groups, level_counts, neighbour_differences, square_sums
 
 GREY = np.random.default_rng(6).integers(0, 256, (47, 70), np.uint8)
 
@@ -36,3 +36,21 @@ def test_levels_are_counted_as_numpy_counts_them(step: int) -> None:
 
 def test_a_flat_image_has_none() -> None:
     assert not neighbour_differences(np.full((36, 64), 9, np.uint8), 18, 32).any()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.4, 0.55, 1.0])
+def test_groups_are_those_of_a_flood(share: float) -> None:
+    cells = np.random.default_rng(round(10 * share)).random((31, 44)) < share
+    expected = np.zeros(cells.shape, np.int64)
+    groups = 0
+    for start in zip(*np.nonzero(cells), strict=True):
+        if expected[start]:
+            continue
+        groups += 1
+        flooded = [start]
+        while flooded:
+            y, x = flooded.pop()
+            if 0 <= y < 31 and 0 <= x < 44 and cells[y, x] and not expected[y, x]:
+                expected[y, x] = groups
+                flooded += [(y + dy, x + dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+    np.testing.assert_array_equal(connected_groups(cells), expected)

@@ -1,4 +1,5 @@
-"""Sums, differences and grey levels over squares or blocks of an image, each in one pass."""
+"""Sums, differences and grey levels over squares or blocks of an image, and connected groups of cells, each in one
+pass."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +61,49 @@ def level_counts(grey: NDArray[np.uint8], step: int) -> NDArray[np.int64]:
         for x in range(0, grey.shape[1], step):
             counts[grey[y, x]] += 1
     return counts
+
+
+@njit(cache=True)
+def connected_groups(cells: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """(h, w): number of the eight-connected group of each True cell of `cells` (h, w), from 1 in the order of their
+    first cells; 0 for False. Disjoint sets (Galler, Fischer 1964), whose root is the first cell."""
+    rows, columns = cells.shape
+    parents = np.arange(rows * columns)
+    for y in range(rows):
+        for x in range(columns):
+            if cells[y, x]:
+                if x > 0 and cells[y, x - 1]:
+                    _unite(parents, y * columns + x, y * columns + x - 1)
+                if y > 0:
+                    for above in range(max(x - 1, 0), min(x + 2, columns)):
+                        if cells[y - 1, above]:
+                            _unite(parents, y * columns + x, (y - 1) * columns + above)
+    numbers = np.zeros((rows, columns), np.int64)
+    groups = 0
+    for y in range(rows):
+        for x in range(columns):
+            if cells[y, x]:
+                first = _first_of(parents, y * columns + x)
+                if first == y * columns + x:
+                    groups += 1
+                    numbers[y, x] = groups
+                else:
+                    numbers[y, x] = numbers[first // columns, first % columns]
+    return numbers
+
+
+@njit(cache=True)
+def _first_of(parents: NDArray[np.int64], cell: int) -> int:
+    while parents[cell] != cell:
+        parents[cell] = parents[parents[cell]]
+        cell = parents[cell]
+    return cell
+
+
+@njit(cache=True)
+def _unite(parents: NDArray[np.int64], a: int, b: int) -> None:
+    first_a, first_b = _first_of(parents, a), _first_of(parents, b)
+    parents[max(first_a, first_b)] = min(first_a, first_b)
 
 
 @njit(cache=True, inline="always")

@@ -12,16 +12,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from math import log
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.geometry.images import square_sums
+from coec.geometry.images import connected_groups, square_sums
 
 Grid = NDArray[np.float64]
 Cells = NDArray[np.bool_]
-Value = TypeVar("Value", np.bool_, np.int64)
 
 GRID_WIDTH = 200
 """About how many cells the grid has across the image. A cell is 7 px of a 1400 px image, wider than shake and rounding
@@ -203,15 +201,9 @@ def _at_pixels(cells: Cells, cell_px: int, width: int, height: int) -> Cells:
 
 def _grown(cells: Cells) -> Cells:
     """The cells and the eight neighbours of each."""
-    return ~_least_around(~cells, border=True)
-
-
-def _least_around(values: NDArray[Value], border: int | bool) -> NDArray[Value]:
-    """The least value of each cell and its eight neighbours, along one axis after the other; beyond the border the
-    value is `border`."""
-    padded = np.pad(values, 1, constant_values=border)
-    columns = np.minimum(np.minimum(padded[:, :-2], padded[:, 1:-1]), padded[:, 2:])
-    return np.asarray(np.minimum(np.minimum(columns[:-2], columns[1:-1]), columns[2:]))
+    padded = np.pad(cells, 1)
+    columns = padded[:, :-2] | padded[:, 1:-1] | padded[:, 2:]
+    return np.asarray(columns[:-2] | columns[1:-1] | columns[2:])
 
 
 def _ring(black: Cells) -> Cells:
@@ -219,20 +211,20 @@ def _ring(black: Cells) -> Cells:
     image circle, not a night sky."""
     rows, columns = black.shape
     corners = [(0, 0), (0, columns - 1), (rows - 1, 0), (rows - 1, columns - 1)]
-    labels = _labels(black)
+    labels = connected_groups(black)
     of_corners = [int(labels[corner]) for corner in corners if labels[corner]]
     return np.isin(labels, of_corners) if len(of_corners) >= 3 else np.zeros_like(black)
 
 
 def _without_specks(cells: Cells) -> Cells:
-    labels = _labels(cells)
+    labels = connected_groups(cells)
     return np.asarray((np.bincount(labels.ravel()) >= MIN_CELLS)[labels] & cells)
 
 
 def _enclosed(still: Cells, body: Cells, dead: Cells) -> Cells:
     """Groups of still cells whose outline belongs to the body. Parts of the outline at other dead cells or at the
     border of the image do not count."""
-    labels = _labels(still)
+    labels = connected_groups(still)
     bounding = np.pad(np.where(body, 1, np.where(dead | still, 0, 2)), 1)
     by_body, by_world = np.zeros((2, int(labels.max()) + 1))
     for window in (bounding[:-2, 1:-1], bounding[2:, 1:-1], bounding[1:-1, :-2], bounding[1:-1, 2:]):
@@ -240,22 +232,3 @@ def _enclosed(still: Cells, body: Cells, dead: Cells) -> Cells:
         by_world += np.bincount(labels[window == 2], minlength=len(by_world))
     enclosed = (by_body > 0) & (by_body >= ENCLOSED_SHARE * (by_body + by_world))
     return np.asarray(enclosed[labels] & still)
-
-
-def _labels(cells: Cells) -> NDArray[np.int64]:
-    """Number of the eight-connected group of every True cell, from 1; 0 for False. The least index spreads."""
-    own = np.where(cells, np.arange(1, cells.size + 1).reshape(cells.shape), 0)
-    big = cells.size + 1
-    spread = np.where(cells, own, big)
-    while True:
-        least = _least_around(spread, border=big)
-        # Follow the chain of least indices: halves the rounds that a long group would need.
-        least = np.where(cells, np.minimum(least, spread), big)
-        flat = np.append(least.ravel(), big)
-        jumped = np.where(cells, flat[np.minimum(least, cells.size) - 1], big)
-        merged = np.minimum(least, jumped)
-        if (merged == spread).all():
-            break
-        spread = merged
-    numbers = np.unique(spread, return_inverse=True)[1].reshape(cells.shape) + 1
-    return np.where(cells, numbers, 0).astype(np.int64)

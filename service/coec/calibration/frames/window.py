@@ -129,7 +129,7 @@ def thinned_sweep(lidar: LidarFrame, T_camera_lidar: Matrix4, half_view_rad: flo
 
 def _near_the_view(xyz_m: NDArray[np.float32], T_camera_lidar: Matrix4, angle_rad: float) -> NDArray[np.bool_]:
     """(N,) whether points lie within an angle of the optical axis. It uses no compiled kernel and no BLAS, see
-    `WindowCutter._points_in_view`."""
+    `WindowCutter._sees_points`."""
     if angle_rad >= pi:
         return np.ones(len(xyz_m), np.bool_)
     x_m, y_m, z_m = xyz_m.T
@@ -210,6 +210,9 @@ class CheckSampler:
 
 CELLS = 180
 """Cells of the table of directions in view, from the optical axis to its opposite (1° each) and all around it (2°)."""
+
+SHARES_OF_SWEEP = 8
+"""Shares of a sweep, each of every eighth point, that are looked at until enough points are in view."""
 
 INSPECTIONS_PER_BIN = 16
 """Pairs of a bin that are inspected before it stays empty. Each inspection decodes an image, and a camera that is
@@ -409,7 +412,7 @@ class WindowCutter:
         standing = stands(pair, config)
         if config.require_motion and standing:
             return "standing"
-        if self._points_in_view(pair, T_camera_lidar) < config.min_points_in_view:
+        if not self._sees_points(pair, T_camera_lidar):
             return "out_of_view"
         previous = self.last_quality
         try:
@@ -427,17 +430,22 @@ class WindowCutter:
             return "frozen"
         return None
 
-    def _points_in_view(self, pair: FramePair, T_camera_lidar: Matrix4) -> int:
-        """Number of points in view, by the table of directions. Its border is a degree wide, which matters little for a
-        limit on the whole number. It uses no compiled kernel, because the process that cuts windows loads no compiler,
-        and no BLAS, whose threads spin."""
-        x_m, y_m, z_m = pair.lidar.xyz_m.T
+    def _sees_points(self, pair: FramePair, T_camera_lidar: Matrix4) -> bool:
+        """Whether enough points are in view, by the table of directions. Its border is a degree wide, which matters
+        little for a limit on the whole number. It uses no compiled kernel, because the process that cuts windows loads
+        no compiler, and no BLAS, whose threads spin."""
         T = T_camera_lidar.astype(np.float32)
-        x, y, z = (T[i, 0] * x_m + T[i, 1] * y_m + T[i, 2] * z_m + T[i, 3] for i in range(3))
-        across = np.arctan2(np.hypot(x, y), z) * (CELLS / np.pi)
-        around = (np.arctan2(y, x) + np.pi) * (0.5 * CELLS / np.pi)
-        cells = tuple(np.minimum(value.astype(np.int64), CELLS - 1) for value in (across, around))
-        return int(np.count_nonzero(self._in_view[cells]))
+        in_view = 0
+        for first in range(SHARES_OF_SWEEP):  # one of them is enough in most sweeps
+            x_m, y_m, z_m = pair.lidar.xyz_m[first::SHARES_OF_SWEEP].T
+            x, y, z = (T[i, 0] * x_m + T[i, 1] * y_m + T[i, 2] * z_m + T[i, 3] for i in range(3))
+            across = np.arctan2(np.hypot(x, y), z) * (CELLS / np.pi)
+            around = (np.arctan2(y, x) + np.pi) * (0.5 * CELLS / np.pi)
+            cells = tuple(np.minimum(value.astype(np.int64), CELLS - 1) for value in (across, around))
+            in_view += int(np.count_nonzero(self._in_view[cells]))
+            if in_view >= self._config.min_points_in_view:
+                return True
+        return False
 
 
 @lru_cache(maxsize=32, typed=True)
