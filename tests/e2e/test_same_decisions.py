@@ -124,7 +124,7 @@ def test_killed_in_a_solve_and_replayed_the_decisions_are_the_same(tmp_path: Pat
     vehicle = of_windows(read_log(tmp_path / "killed" / "state", pair))
     frames = between(small, 0, finished_s + OVER_S)
     drive = DriveReplay(load_config(config), tmp_path / "replayed", frames[0].stamp_ns, 1)
-    whole = drive.run(iter(frames), lambda _: None)
+    whole = drive.run({pair: iter(frames)}, lambda _: None)[pair]
     assert {one.kind for one in vehicle} == {"estimate", "extrinsic"}
     assert differences(vehicle, of_windows(whole.decisions)) == ()
 

@@ -6,7 +6,7 @@ import gc
 import json
 import random
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import cast
@@ -19,6 +19,7 @@ from coec.config import Config
 from coec.errors import SourceError
 from coec.service import camera_lidar_pair as runtime_pair
 from coec.service import drive_replay
+from coec.service.api.rig_answers import reply_of
 from coec.service.decision_log import (
     Decision,
     ReplayedDrive,
@@ -31,7 +32,17 @@ from coec.service.decision_log import (
 from coec.service.drive_replay import DriveReplay, read_ahead
 from coec.service.worker.worker_jobs import WorkerJob
 from service.test_pair_disturbed import streams
-from support.vehicles import BEGIN_S, NS_PER_S, STEP_S, InstantRecorder, OracleWorker, PairBench, pair_configuration
+from service.test_pair_rig import CAMERAS, RigBench, rig_configuration
+from support.vehicles import (
+    BEGIN_S,
+    NS_PER_S,
+    STEP_S,
+    InstantRecorder,
+    OracleWorker,
+    PairBench,
+    frame_pair_at,
+    pair_configuration,
+)
 
 PAIR = "front"
 
@@ -77,8 +88,8 @@ def replayed(folder: Path, monkeypatch: pytest.MonkeyPatch, seed: int = 0) -> Re
     monkeypatch.setattr(drive_replay, "_ReplayWorkers", Dawdling)
     monkeypatch.setattr(runtime_pair, "Recorder", InstantRecorder)
     drive = DriveReplay(pair_configuration(folder), folder, frames[0].stamp_ns, 1)
-    cast("InstantRecorder", drive._pair.recorder).worker = cast("Dawdling", drive._workers).oracle
-    return drive.run(iter(frames), lambda _: None)
+    cast("InstantRecorder", drive._pairs[0].recorder).worker = cast("Dawdling", drive._workers).oracle
+    return drive.run({PAIR: iter(frames)}, lambda _: None)[PAIR]
 
 
 @pytest.mark.fault("a replay whose workers answer late and out of order", "the same decisions, to the byte")
@@ -86,7 +97,7 @@ def test_the_decisions_of_a_drive_do_not_depend_on_the_workers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record_property: Callable[[str, object], None]
 ) -> None:
     drives = [replayed(tmp_path / str(seed), monkeypatch, seed) for seed in range(2)]
-    logs = [[decision.line() for decision in drive.decisions] for drive in drives]
+    logs = [[decision.line(PAIR) for decision in drive.decisions] for drive in drives]
     assert logs[0] == logs[1]
     record_property("figure", f"{len(logs[0])} decisions, all equal")
     kinds = {decision.kind for decision in drives[0].decisions}
@@ -97,28 +108,62 @@ def test_the_decisions_of_a_drive_do_not_depend_on_the_workers(
     assert drives[0].driven_s == pytest.approx(200.0, abs=1.0)
 
 
-def frames_of(sizes: Sequence[int], read: list[int]) -> Iterator[LidarFrame]:
+@pytest.mark.fault("a replayed rig whose LiDAR is knocked, workers that dawdle", "one correction, the same to the byte")
+def test_a_rig_is_replayed_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drive_replay, "_ReplayWorkers", Dawdling)
+    monkeypatch.setattr(runtime_pair, "Recorder", InstantRecorder)
+    stamps_ns = range((STEP_S - 45) * NS_PER_S, (STEP_S + 65) * NS_PER_S, NS_PER_S // 2)
+    logs, rigs = [], []
+    for seed in range(2):
+        monkeypatch.setattr(Dawdling, "seed", seed)
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        drive = DriveReplay(rig_configuration(folder, "within_limits"), folder, stamps_ns[0], 1)
+        for pair in drive._pairs:
+            cast("InstantRecorder", pair.recorder).worker = cast("Dawdling", drive._workers).oracle
+        drives = drive.run({name: frames_at(stamps_ns) for name in CAMERAS}, lambda _: None)
+        logs.append({name: [one.line(name) for one in of_pair.decisions] for name, of_pair in drives.items()})
+        rigs.append(reply_of("test", drive.rig))
+        assert {name: of_pair.losses for name, of_pair in drives.items()} == {name: {} for name in CAMERAS}
+        assert {of_pair.health for of_pair in drives.values()} == {"healthy"}
+    assert logs[0] == logs[1]
+    assert rigs[0] == rigs[1]
+    assert rigs[0].correction is not None
+    assert (rigs[0].correction.sensors, set(rigs[0].correction.pairs)) == (("roof",), set(CAMERAS))
+    bench = RigBench(tmp_path / "live")
+    bench.drive(STEP_S - 45, STEP_S + 65)
+    assert bench.reply.correction == rigs[0].correction
+
+
+def frames_at(stamps_ns: Iterable[int]) -> Iterator[CameraFrame | LidarFrame | EgoMotion]:
+    for stamp_ns in stamps_ns:
+        pair = frame_pair_at(stamp_ns)
+        assert pair.motion is not None
+        yield from (pair.motion, pair.lidar, pair.camera)
+
+
+def frames_of(sizes: Sequence[int], read: list[int]) -> Iterator[tuple[str, LidarFrame]]:
     for stamp_ns, size in enumerate(sizes):
         read.append(stamp_ns)
-        yield LidarFrame(stamp_ns, "lidar", np.zeros((size, 3), np.float32))
+        yield "0", LidarFrame(stamp_ns, "lidar", np.zeros((size, 3), np.float32))
 
 
 def test_frames_are_read_ahead_in_their_order_and_within_the_bytes() -> None:
     read: list[int] = []
     most = 12 * 100
-    for number, frame in enumerate(read_ahead(frames_of([40, 70, 300, 1, 1, 90, 20] * 9, read), most)):
+    for number, (_, frame) in enumerate(read_ahead(frames_of([40, 70, 300, 1, 1, 90, 20] * 9, read), most)):
         assert frame.stamp_ns == number
         assert len(read) <= number + 1 + 1 + 5, "those that wait, and one that has no room"
     assert read == list(range(63))
 
 
 def test_an_error_of_the_reader_comes_after_the_frames_before_it() -> None:
-    def broken() -> Iterator[LidarFrame]:
+    def broken() -> Iterator[tuple[str, LidarFrame]]:
         yield from frames_of([1, 1], [])
         raise SourceError("cut off")
 
     frames = read_ahead(broken(), 10)
-    assert [next(frames).stamp_ns for _ in range(2)] == [0, 1]
+    assert [next(frames)[1].stamp_ns for _ in range(2)] == [0, 1]
     with pytest.raises(SourceError, match="cut off"):
         next(frames)
 
@@ -126,7 +171,7 @@ def test_an_error_of_the_reader_comes_after_the_frames_before_it() -> None:
 def test_a_reader_ends_with_those_who_use_its_frames() -> None:
     read: list[int] = []
     frames = read_ahead(frames_of([100] * 50, read), 12 * 100)
-    assert next(frames).stamp_ns == 0
+    assert next(frames)[1].stamp_ns == 0
     frames.close()  # type: ignore[attr-defined]  # a generator
     assert len(read) < 10
     assert "reader" not in [thread.name for thread in threading.enumerate()]
@@ -145,8 +190,9 @@ def test_a_log_is_read_as_it_was_written_and_that_of_a_vehicle_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drive = replayed(tmp_path / "replay", monkeypatch)
-    write_log(tmp_path / "log.jsonl", drive.decisions)
+    write_log(tmp_path / "log.jsonl", {PAIR: drive.decisions, "rear": drive.decisions[:3]})
     assert differences(read_log(tmp_path / "log.jsonl", PAIR), drive.decisions) == ()
+    assert differences(read_log(tmp_path / "log.jsonl", "rear"), drive.decisions[:3]) == ()
     bench = PairBench(tmp_path / "live")
     bench.drive(BEGIN_S, BEGIN_S + 60)
     vehicle = read_log(tmp_path / "live", PAIR)
@@ -199,9 +245,9 @@ def test_people_read_the_outline_the_steps_and_the_page(tmp_path: Path, monkeypa
     around = [one for one in drive.transitions if abs((one.stamp_ns - drive.begin_ns) / NS_PER_S - moved_s) < 20.0]
     assert {"frame pair", "job ended: result"} <= {one.event for one in around}
     assert any("check of 5 pairs, counts from" in action for one in around for action in one.actions)
-    write_replay_page(tmp_path / "page.html", "drive", drive, drive.begin_ns, ())
+    write_replay_page(tmp_path / "page.html", "drive", {PAIR: drive}, drive.begin_ns, {PAIR: ()})
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "The decisions are equal." in page
     assert "miscalibrated" in page
-    assert json.loads(drive.decisions[0].line())["kind"] in ("check", "state")
+    assert json.loads(drive.decisions[0].line(PAIR))["kind"] in ("check", "state")
     assert np.isfinite(drive.elapsed_s)

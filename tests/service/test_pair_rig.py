@@ -50,7 +50,7 @@ from support.vehicles import (
 CAMERAS = ("front", "left", "rear")
 
 
-def _configuration(folder: Path, apply: str) -> Config:
+def rig_configuration(folder: Path, apply: str) -> Config:
     config = pair_configuration(folder, apply)
     (pair,) = config.pairs
     lidar = pair.lidar.model_copy(update={"name": "roof"})
@@ -75,7 +75,7 @@ class RigBench:
     def __init__(self, folder: Path, seed: int = 0, config: Config | None = None, dim: str | None = None) -> None:
         """`dim` is a pair whose checks tell nothing."""
         folder.mkdir(parents=True)
-        config = config or _configuration(folder, "within_limits")
+        config = config or rig_configuration(folder, "within_limits")
         self.rng = random.Random(seed)
         self.keys = Keys("coec", config.vehicle)
         disk_writer: DiskWriter = InstantDiskWriter(folder)
@@ -203,7 +203,7 @@ def test_a_pair_that_suspects_nothing_has_its_window_as_soon_as_its_sensor_is_na
     tmp_path: Path, record_property: Callable[[str, object], None]
 ) -> None:
     """Its ordinary slice, which begins again when all pairs serve what they found, would end a minute later."""
-    config = _configuration(tmp_path / "one", "within_limits")
+    config = rig_configuration(tmp_path / "one", "within_limits")
     window = config.pairs[0].window.model_copy(update={"slice_s": SLICE_S})
     config = config.model_copy(
         update={"pairs": tuple(pair.model_copy(update={"window": window}) for pair in config.pairs)}
@@ -219,7 +219,7 @@ def test_a_pair_that_suspects_nothing_has_its_window_as_soon_as_its_sensor_is_na
 
 
 def test_where_people_decide_the_correction_waits_for_them(tmp_path: Path) -> None:
-    bench = RigBench(tmp_path / "state", config=_configuration(tmp_path / "state", "never"))
+    bench = RigBench(tmp_path / "state", config=rig_configuration(tmp_path / "state", "never"))
     bench.drive(STEP_S - 45, STEP_S + 50)
     assert bench.reply.correction is None or set(bench.reply.correction.pairs) == set(CAMERAS)
     assert {sensor.name: sensor.state for sensor in bench.reply.sensors}["roof"] == "lidar_moved"
@@ -241,9 +241,9 @@ def test_the_number_of_threads_does_not_depend_on_that_of_the_pairs(
         create(self, name, run)
 
     monkeypatch.setattr(ServiceThread, "__init__", created)
-    (pair, *_) = _configuration(tmp_path, "never").pairs
+    (pair, *_) = rig_configuration(tmp_path, "never").pairs
     pairs = tuple(pair.model_copy(update={"name": f"pair-{index}"}) for index in range(number))
-    RigBench(tmp_path / "state", config=_configuration(tmp_path, "never").model_copy(update={"pairs": pairs}))
+    RigBench(tmp_path / "state", config=rig_configuration(tmp_path, "never").model_copy(update={"pairs": pairs}))
     assert sorted(threads) == ["disk-writer", "engine", "recorder"], "what the pairs share"
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from coec.calibration.types import Frame
     from coec.config import Config, PairConfig
     from coec.io.recordings.recording_source import RecordingSource
+    from coec.schemas.rig_state import RigReply
     from coec.service.decision_log import Difference, ReplayedDrive
 
 NS_PER_S = 1_000_000_000
@@ -41,7 +42,9 @@ def replay(
         Path | None,
         typer.Option(help="Configuration of the service whose drive it is; else defaults.", metavar="FILE"),
     ] = None,
-    pair: Annotated[str | None, typer.Option(help="Pair of the configuration.")] = None,
+    pair: Annotated[
+        str | None, typer.Option(help="Only this pair of the configuration; else all of them, as one rig.")
+    ] = None,
     log: Annotated[Path | None, typer.Option(help="Write the decisions of the drive here (JSON lines).")] = None,
     against: Annotated[
         Path | None,
@@ -69,6 +72,8 @@ def replay(
     other recording goes through the engine of the service, faster than real time and without losing a frame; its
     decisions are listed, and compared with those of another version or of a vehicle.
     """
+    from coec.service.decision_log import write_log, write_replay_page
+
     window = Path(source)
     options = {
         "--config": config,
@@ -85,9 +90,28 @@ def replay(
         if given:
             raise UsageError(f"{window} is a window; {', '.join(given)} applies to the replay of a drive")
         return _replay_window(window, depth, as_json=as_json)
-    recording, configuration = _opened(source, config, pair, depth)
-    replayed = _replay_drive(recording, configuration, begin_s, until_s)
-    return _show_drive(replayed, recording, configuration.pairs[0].name, (log, against, report), explain_s, as_json)
+    recordings, configuration = _opened(source, config, pair, depth)
+    drives, rig = _replay_drive(recordings, configuration, begin_s, until_s)
+    first_ns = min(recording.camera_stamps_ns[0] for recording in recordings.values())
+    differing = None if against is None else {name: _compared(against, name, drive) for name, drive in drives.items()}
+    if log is not None:
+        write_log(log, {name: drive.decisions for name, drive in drives.items()})
+    if report is not None:
+        write_replay_page(report, source, drives, first_ns, differing)
+    if as_json:
+        compared: Mapping[str, tuple[Difference, ...] | None] = differing or dict.fromkeys(drives)
+        documents = {name: _document(drive, compared[name]) for name, drive in drives.items()}
+        whole = {"pairs": documents, "rig": rig.model_dump(mode="json")}
+        console.print_json(whole if len(documents) > 1 else documents[next(iter(documents))])
+    elif explain_s is not None:
+        _explain(drives, first_ns, explain_s)
+    else:
+        _table(drives, first_ns)
+        if len(drives) > 1:
+            _show_rig(rig)
+    if against is not None and differing is not None and not as_json:
+        _show_differences(differing, against, first_ns)
+    return 1 if differing is not None and any(differing.values()) else 0
 
 
 # --- a window -------------------------------------------------------------------------------------------------------
@@ -152,8 +176,10 @@ def _replay_window(window: Path, depth: str | None, *, as_json: bool) -> int:
 # --- a drive --------------------------------------------------------------------------------------------------------
 
 
-def _opened(source: str, file: Path | None, name: str | None, depth: str | None) -> tuple[RecordingSource, Config]:
-    """The recording, and a configuration with the one pair that takes it."""
+def _opened(
+    source: str, file: Path | None, name: str | None, depth: str | None
+) -> tuple[dict[str, RecordingSource], Config]:
+    """A recording for each pair, by its name, and the configuration of these pairs."""
     from coec.cli.convert import configuration_for
     from coec.config import Config, load_config
     from coec.io.recordings.layouts import open_source
@@ -161,26 +187,49 @@ def _opened(source: str, file: Path | None, name: str | None, depth: str | None)
     if file is None:
         recording = open_source(source)
         pair = configuration_for(recording, recording.T_camera_lidar_start, None)
-        config = Config(pairs=(pair,))
+        recordings, config = {pair.name: recording}, Config(pairs=(pair,))
     else:
         config = load_config(file)
         pairs = [pair for pair in config.pairs if name in (None, pair.name)]
-        if len(pairs) != 1:
+        if not pairs:
             known = ", ".join(pair.name for pair in config.pairs)
-            raise UsageError(f"{file} has {'no such pair' if name else 'several pairs'}: --pair is one of {known}")
+            raise UsageError(f"{file} has no such pair: --pair is one of {known}")
         config = config.model_copy(update={"pairs": tuple(pairs)})
-        (pair,) = pairs
-        try:
-            recording = open_source(source)
-        except SourceError:
-            if (of_pair := _with_topics(source, pair)) is None:
-                raise
-            recording = open_source(of_pair)
+        recordings = {pair.name: _recording_of(source, pair, alone=len(pairs) == 1) for pair in pairs}
     if depth is not None:
-        network = pair.calibration.depth.model_copy(update={"model": depth})
-        calibration = pair.calibration.model_copy(update={"depth": network})
-        config = config.model_copy(update={"pairs": (pair.model_copy(update={"calibration": calibration}),)})
-    return recording, config
+        network = {"model": depth}
+        pairs = [
+            pair.model_copy(update={"calibration": pair.calibration.model_copy(update={"depth": of_pair})})
+            for pair in config.pairs
+            for of_pair in (pair.calibration.depth.model_copy(update=network),)
+        ]
+        config = config.model_copy(update={"pairs": tuple(pairs)})
+    return recordings, config
+
+
+def _recording_of(source: str, pair: PairConfig, *, alone: bool) -> RecordingSource:
+    """The recording of a pair: a source of one camera and one LiDAR if it is `alone`; else the topics of a bag.
+
+    Raises:
+        UsageError: several pairs, and no bag or no topics.
+        SourceError: the source cannot be opened.
+    """
+    from coec.io.recordings.layouts import open_source
+
+    of_pair = _with_topics(source, pair)
+    if of_pair is None and not alone:
+        raise UsageError(
+            f"a rig is replayed from a bag and topics (`camera.topic`, `lidar.topic`): {source} is no bag, or pair "
+            f"{pair.name} has none; name one pair with --pair"
+        )
+    if not alone:
+        return open_source(str(of_pair))
+    try:
+        return open_source(source)
+    except SourceError:
+        if of_pair is None:
+            raise
+        return open_source(of_pair)
 
 
 def _with_topics(source: str, pair: PairConfig) -> str | None:
@@ -198,20 +247,26 @@ def _with_topics(source: str, pair: PairConfig) -> str | None:
     return f"{source}{'&' if spec.query else '?'}{urlencode(topics, safe='/')}"
 
 
-def _replay_drive(recording: RecordingSource, config: Config, begin_s: float, until_s: float | None) -> ReplayedDrive:
+def _replay_drive(
+    recordings: Mapping[str, RecordingSource], config: Config, begin_s: float, until_s: float | None
+) -> tuple[dict[str, ReplayedDrive], RigReply]:
     from tempfile import TemporaryDirectory
 
+    from coec.service.api.rig_answers import reply_of
     from coec.service.drive_replay import DriveReplay
 
-    if not recording.camera_stamps_ns:
-        raise SourceError(f"{recording.name} holds no camera frame")
-    first_ns = recording.camera_stamps_ns[0]
+    for recording in recordings.values():
+        if not recording.camera_stamps_ns:
+            raise SourceError(f"{recording.name} holds no camera frame")
+    first_ns = min(recording.camera_stamps_ns[0] for recording in recordings.values())
+    last_ns = max(recording.camera_stamps_ns[-1] for recording in recordings.values())
     begin_ns = first_ns + round(begin_s * NS_PER_S)
-    end_ns = recording.camera_stamps_ns[-1] if until_s is None else first_ns + round(until_s * NS_PER_S)
-    if begin_ns > min(end_ns, recording.camera_stamps_ns[-1]):
-        raise UsageError(f"no camera frame lies between --from and --until: {recording.name} is shorter")
+    end_ns = last_ns if until_s is None else first_ns + round(until_s * NS_PER_S)
+    name = next(iter(recordings.values())).name
+    if begin_ns > min(end_ns, last_ns):
+        raise UsageError(f"no camera frame lies between --from and --until: {name} is shorter")
 
-    def frames() -> Iterator[Frame]:
+    def frames(recording: RecordingSource) -> Iterator[Frame]:
         # Motion before the first image and after the last one belongs to them.
         for frame in recording.messages():
             if until_s is not None and frame.stamp_ns > end_ns:
@@ -220,45 +275,20 @@ def _replay_drive(recording: RecordingSource, config: Config, begin_s: float, un
                 yield frame
 
     with TemporaryDirectory() as folder, console.progress() as bars:
-        task = bars.add_task(recording.name, total=max((end_ns - begin_ns) / NS_PER_S, 1e-3))
+        task = bars.add_task(name, total=max((end_ns - begin_ns) / NS_PER_S, 1e-3))
         # A second worker only helps if reading and the engine leave it a core.
         workers = 2 if len(os.sched_getaffinity(0)) > 2 else 1
         drive = DriveReplay(config, Path(folder), begin_ns, workers)
-        return drive.run(frames(), lambda stamp_ns: bars.update(task, completed=(stamp_ns - begin_ns) / NS_PER_S))
+        streams = {name: frames(recording) for name, recording in recordings.items()}
+        drives = drive.run(streams, lambda stamp_ns: bars.update(task, completed=(stamp_ns - begin_ns) / NS_PER_S))
+        return drives, reply_of(config.vehicle, drive.rig)
 
 
-def _show_drive(
-    replayed: ReplayedDrive,
-    recording: RecordingSource,
-    pair: str,
-    files: tuple[Path | None, Path | None, Path | None],
-    explain_s: float | None,
-    as_json: bool,
-) -> int:
-    from coec.service.decision_log import differences, read_log, write_log
+def _compared(against: Path, pair: str, drive: ReplayedDrive) -> tuple[Difference, ...]:
+    from coec.service.decision_log import differences, read_log
 
-    log, against, report = files
-    first_ns = recording.camera_stamps_ns[0]
-    differing: tuple[Difference, ...] = ()
-    if against is not None:
-        there = [one for one in read_log(against, pair) if replayed.begin_ns <= one.stamp_ns <= replayed.end_ns]
-        differing = differences(there, replayed.decisions)
-    if log is not None:
-        write_log(log, replayed.decisions)
-    if report is not None:
-        from coec.service.decision_log import write_replay_page
-
-        write_replay_page(report, recording.name, replayed, first_ns, None if against is None else differing)
-    if as_json:
-        console.print_json(_document(replayed, None if against is None else differing))
-        return 1 if differing else 0
-    if explain_s is None:
-        _table(replayed, first_ns)
-    else:
-        _explain(replayed, first_ns, explain_s)
-    if against is not None:
-        _show_differences(differing, against, first_ns)
-    return 1 if differing else 0
+    there = [one for one in read_log(against, pair) if drive.begin_ns <= one.stamp_ns <= drive.end_ns]
+    return differences(there, drive.decisions)
 
 
 def _document(replayed: ReplayedDrive, differing: tuple[Difference, ...] | None) -> dict[str, Any]:
@@ -286,34 +316,46 @@ def _document(replayed: ReplayedDrive, differing: tuple[Difference, ...] | None)
     }
 
 
-def _table(replayed: ReplayedDrive, first_ns: int) -> None:
+def _table(drives: Mapping[str, ReplayedDrive], first_ns: int) -> None:
     """Prints what was decided, without the checks that changed nothing."""
     from coec.service.decision_log import outline
 
-    checks = [one for one in replayed.decisions if one.kind == "check"]
-    windows = [one for one in replayed.decisions if one.kind == "estimate"]
-    table = console.table("s", "decision", "", "")
-    for line in outline(replayed.decisions, first_ns):
-        table.add_row(line.time, line.kind, line.name, line.text)
+    for name, drive in drives.items():
+        checks = [one for one in drive.decisions if one.kind == "check"]
+        windows = [one for one in drive.decisions if one.kind == "estimate"]
+        table = console.table("s", "decision", "", "")
+        for line in outline(drive.decisions, first_ns):
+            table.add_row(line.time, line.kind, line.name, line.text)
+        console.out.print(table)
+        lost = sum(drive.losses.values())
+        of_pair = "" if len(drives) == 1 else f"{name}: "
+        console.show(
+            f"{of_pair}{count(len(checks), 'check')}, {count(len(windows), 'window')}, "
+            f"{count(lost, 'loss', 'losses')}, {drive.health} at the end"
+        )
+    pace = drive.driven_s / max(drive.elapsed_s, 1e-9)
+    console.show(f"{drive.driven_s:.0f} s of driving in {drive.elapsed_s:.0f} s ({pace:.1f} times as fast)")
+
+
+def _show_rig(rig: RigReply) -> None:
+    """Prints the state of every sensor at the end of the drive."""
+    table = console.table("sensor", "state", "")
+    for sensor in rig.sensors:
+        table.add_row(sensor.name, console.styled(sensor.state), " ".join(reason.text for reason in sensor.reasons))
     console.out.print(table)
-    lost = sum(replayed.losses.values())
-    pace = replayed.driven_s / max(replayed.elapsed_s, 1e-9)
-    console.show(
-        f"{count(len(checks), 'check')}, {count(len(windows), 'window')}, {count(lost, 'loss', 'losses')}, "
-        f"{replayed.health} at the end; {replayed.driven_s:.0f} s of driving in {replayed.elapsed_s:.0f} s "
-        f"({pace:.1f} times as fast)"
-    )
 
 
-def _show_differences(differing: tuple[Difference, ...], against: Path, first_ns: int) -> None:
-    if not differing:
+def _show_differences(differing: Mapping[str, tuple[Difference, ...]], against: Path, first_ns: int) -> None:
+    number = sum(len(of_pair) for of_pair in differing.values())
+    if not number:
         console.show(f"equal to {against}", "bold green")
         return
-    console.show(f"{count(len(differing), 'difference')} from {against}", "bold red")
-    table = console.table("s", "decision", "there", "here", "fields")
-    for one in differing:
+    console.show(f"{count(number, 'difference')} from {against}", "bold red")
+    table = console.table("pair", "s", "decision", "there", "here", "fields")
+    for pair, one in ((pair, one) for pair, of_pair in differing.items() for one in of_pair):
         before, after = one.before, one.after
         table.add_row(
+            pair,
             f"{(one.either.stamp_ns - first_ns) / NS_PER_S:.1f}",
             one.either.kind,
             "none" if before is None else before.name,
@@ -323,15 +365,16 @@ def _show_differences(differing: tuple[Difference, ...], against: Path, first_ns
     console.out.print(table)
 
 
-def _explain(replayed: ReplayedDrive, first_ns: int, moment_s: float) -> None:
+def _explain(drives: Mapping[str, ReplayedDrive], first_ns: int, moment_s: float) -> None:
     """Prints the steps of the engine around a moment of the drive."""
-    table = console.table("s", "event", "actions", "health")
-    for one in replayed.transitions:
+    table = console.table("pair", "s", "event", "actions", "health")
+    steps = [(name, one) for name, drive in drives.items() for one in drive.transitions]
+    for name, one in sorted(steps, key=lambda step: step[1].stamp_ns):
         at_s = (one.stamp_ns - first_ns) / NS_PER_S
         if abs(at_s - moment_s) <= AROUND_S:
             before, after = one.health
             health = after if before == after else f"{before} to {after}"
-            table.add_row(f"{at_s:.1f}", one.event, ", ".join(one.actions) or "none", health)
+            table.add_row(name, f"{at_s:.1f}", one.event, ", ".join(one.actions) or "none", health)
     if not table.row_count:
         raise UsageError(f"the engine did nothing within {AROUND_S:g} s of {moment_s:g} s")
     console.out.print(table)

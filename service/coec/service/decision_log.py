@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -48,9 +48,9 @@ class Decision:
     name: str
     values: dict[str, Any]
 
-    def line(self) -> str:
+    def line(self, pair: str) -> str:
         """As a line of a log."""
-        return json.dumps(asdict(self), sort_keys=True, separators=(",", ":"))
+        return json.dumps({"pair": pair, **asdict(self)}, sort_keys=True, separators=(",", ":"))
 
 
 def decisions_of(records: PairRecords) -> tuple[Decision, ...]:
@@ -77,7 +77,7 @@ def _decisions(records: PairRecords) -> Iterator[Decision]:
 
 
 def read_log(path: Path, pair: str) -> tuple[Decision, ...]:
-    """The decisions in a log, or in the state directory of a service.
+    """The decisions about a pair in a log, or in the state directory of a service.
 
     Raises:
         SourceError: there is no such file, or it is neither.
@@ -87,9 +87,11 @@ def read_log(path: Path, pair: str) -> tuple[Decision, ...]:
     try:
         if path.stat().st_size > MOST_BYTES:
             raise SourceError(f"{path} is larger than {MOST_BYTES / 1e6:.0f} MB: it is no log of decisions")
-        documents = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        documents = [dict(json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
         return tuple(
-            Decision(str(one["kind"]), int(one["stamp_ns"]), str(one["name"]), dict(one["values"])) for one in documents
+            Decision(str(one["kind"]), int(one["stamp_ns"]), str(one["name"]), dict(one["values"]))
+            for one in documents
+            if one.get("pair", pair) == pair  # logs of older versions are of one pair
         )
     except OSError as error:
         raise SourceError(f"{path} cannot be read: {error.strerror}") from error
@@ -117,14 +119,15 @@ def _of_state_directory(folder: Path, pair: str) -> tuple[Decision, ...]:
     return decisions
 
 
-def write_log(path: Path, decisions: Iterable[Decision]) -> None:
-    """Writes a log.
+def write_log(path: Path, decisions: Mapping[str, Iterable[Decision]]) -> None:
+    """Writes a log of the decisions about each pair.
 
     Raises:
         UsageError: the file cannot be written.
     """
     try:
-        path.write_text("".join(f"{one.line()}\n" for one in decisions), encoding="utf-8")
+        lines = [f"{one.line(pair)}\n" for pair, of_pair in decisions.items() for one in of_pair]
+        path.write_text("".join(lines), encoding="utf-8")
     except OSError as error:
         raise UsageError(f"{path} cannot be written: {error.strerror}") from error
 
@@ -274,31 +277,36 @@ def _text(decision: Decision) -> str:
 
 
 def write_replay_page(
-    path: Path, name: str, replayed: ReplayedDrive, first_ns: int, differing: Sequence[Difference] | None
+    path: Path,
+    name: str,
+    replayed: Mapping[str, ReplayedDrive],
+    first_ns: int,
+    differing: Mapping[str, Sequence[Difference]] | None,
 ) -> None:
-    """Writes a page with the decisions of a drive and, if they were compared, what differs.
+    """Writes a page with the decisions of a drive about each pair and, if they were compared, what differs.
 
     Raises:
         RecordingError: the file cannot be written.
     """
-    rows = [(line.time, line.kind, line.name, line.text) for line in outline(replayed.decisions, first_ns)]
-    sections = [
-        Section("Decisions", (Table("In the order of sensor time.", HEADS, rows, frozenset({0}), frozenset({3})),))
-    ]
-    if differing is not None:
-        sections.insert(0, Section("Differences", (_differences(differing, first_ns),)))
-    losses = tuple((f"{place}, {cause}", str(number)) for (place, cause), number in sorted(replayed.losses.items()))
-    if losses:
-        sections.append(Section("Losses", (Facts(losses),)))
-    facts = Facts(
-        (
-            ("Length of the drive", f"{replayed.driven_s:.0f} s"),
-            ("Health at the end", replayed.health),
-            ("Checks", str(sum(one.kind == "check" for one in replayed.decisions))),
-            ("Windows", str(sum(one.kind == "estimate" for one in replayed.decisions))),
-        )
-    )
-    write(path, Page("Replay of a drive", name, (facts,), tuple(sections)))
+    sections: list[Section] = []
+    facts: list[tuple[str, str]] = []
+    for pair, drive in replayed.items():
+        of_pair = "" if len(replayed) == 1 else f"{pair}: "
+        if differing is not None:
+            sections.append(Section(f"{of_pair}Differences", (_differences(differing[pair], first_ns),)))
+        rows = [(line.time, line.kind, line.name, line.text) for line in outline(drive.decisions, first_ns)]
+        decisions = Table("In the order of sensor time.", HEADS, rows, frozenset({0}), frozenset({3}))
+        sections.append(Section(f"{of_pair}Decisions", (decisions,)))
+        losses = tuple((f"{place}, {cause}", str(number)) for (place, cause), number in sorted(drive.losses.items()))
+        if losses:
+            sections.append(Section(f"{of_pair}Losses", (Facts(losses),)))
+        facts += [
+            (f"{of_pair}Length of the drive", f"{drive.driven_s:.0f} s"),
+            (f"{of_pair}Health at the end", drive.health),
+            (f"{of_pair}Checks", str(sum(one.kind == "check" for one in drive.decisions))),
+            (f"{of_pair}Windows", str(sum(one.kind == "estimate" for one in drive.decisions))),
+        ]
+    write(path, Page("Replay of a drive", name, (Facts(tuple(facts)),), tuple(sections)))
 
 
 HEADS = ("Time, s", "Decision", "Outcome", "Details")

@@ -9,14 +9,16 @@ and a thread reads ahead. The engine takes the frames as they were read, and che
 
 from __future__ import annotations
 
+import heapq
 import os
 import queue
 import re
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from math import ceil
 from pathlib import Path
 from typing import cast
 
@@ -34,7 +36,8 @@ from coec.service.camera_lidar_pair import CameraLidarPair
 from coec.service.cpu_budget import Budget
 from coec.service.decision_log import MOST_CHECKS, MOST_ENTRIES, ReplayedDrive, Transition, decisions_of
 from coec.service.engine import messages
-from coec.service.engine.rig import RigEstimator
+from coec.service.engine.lidar_pairs import LidarPairs, LidarPairStream
+from coec.service.engine.rig import RigEstimator, RigSnapshot
 from coec.service.engine.vehicle import Vehicle
 from coec.service.ingest.pair_stream import frame_bytes
 from coec.service.process_lifetime import joined
@@ -70,15 +73,19 @@ MOST_THREADS = 16
 """Threads of a worker, if the machine has so many cores: the result does not depend on their number."""
 
 
-def read_ahead(frames: Iterator[Frame], max_bytes: int) -> Iterator[Frame]:
+StreamFrame = tuple[str, Frame]
+"""A frame, and the number of its stream."""
+
+
+def read_ahead(frames: Iterator[StreamFrame], max_bytes: int) -> Iterator[StreamFrame]:
     """The same frames, read on a thread of their own while earlier ones are used. Up to `max_bytes` of them wait."""
     condition = threading.Condition()
-    waiting: deque[tuple[Frame | Exception | None, int]] = deque()
+    waiting: deque[tuple[StreamFrame | Exception | None, int]] = deque()
     waiting_bytes, is_open = 0, True
 
-    def put(item: Frame | Exception | None) -> bool:
+    def put(item: StreamFrame | Exception | None) -> bool:
         nonlocal waiting_bytes
-        size = 0 if item is None or isinstance(item, Exception) else frame_bytes(item)
+        size = frame_bytes(item[1]) if isinstance(item, tuple) else 0
         with condition:
             condition.wait_for(lambda: not is_open or not waiting or waiting_bytes + size <= max_bytes)
             waiting.append((item, size))
@@ -206,6 +213,16 @@ class _ReplayedPair(CameraLidarPair):
         self.transitions: list[Transition] = []
         super().__init__(pair, config, context)
 
+    @property
+    def oldest_request(self) -> messages.PairRequest | None:
+        """The request whose result is to be concluded next; None if there is none."""
+        return self.engine.oldest_request
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a frame pair cannot be evaluated until a result, or the rig, has come as far."""
+        return bool(self.stream.held.pairs) and self.engine.is_waiting
+
     def _step(self, event: messages.Event) -> None:
         before = self.engine.store.state.health.value
         actions = self.engine.step(event)
@@ -228,10 +245,10 @@ class _ReplayedPair(CameraLidarPair):
 
 
 class DriveReplay:
-    """The replay of one drive of one pair, in a state directory of its own."""
+    """The replay of one drive, with all pairs of a configuration as one rig, in a state directory of its own."""
 
     def __init__(self, config: Config, folder: Path, first_ns: int, workers: int) -> None:
-        """`config` has one pair. `first_ns`: stamp of the first frame. `workers`: number of worker processes.
+        """`first_ns`: stamp of the first frame. `workers`: number of worker processes.
 
         Raises:
             ConfigError, RecordingError: the rig cannot be built, or the folder cannot be used.
@@ -245,11 +262,13 @@ class DriveReplay:
         budget = BudgetConfig(cores=MOST_CORES)
         config = config.model_copy(update={"state": state, "budget": budget, "log": log, "worker": worker})
         self._clock = DriveClock(first_ns)
+        self._silence_ns = ceil((worker.timeout_s + 1.0) * NS_PER_S)
         self._workers = _ReplayWorkers(config, workers)
         self._disk_writer = DiskWriter(folder)
         self._recording = RecordingThread()
         windows = WindowStore(folder / "windows", state)
-        self._vehicle = _ReplayVehicle(config, RigEstimator(folder, (), self._disk_writer), self._clock)
+        self._vehicle = _ReplayVehicle(config, RigEstimator(folder, config.links, self._disk_writer), self._clock)
+        workers_in_place = cast("Worker", self._workers)
         context = VehicleContext(
             keys=Keys(config.prefix, config.vehicle),
             vehicle=self._vehicle,
@@ -257,16 +276,28 @@ class DriveReplay:
             disk_writer=self._disk_writer,
             folder=windows,
             recording=self._recording,
-            worker=cast("Worker", self._workers),
+            worker=workers_in_place,
             publish=lambda *_: None,
             vehicle_problems=tuple,
             show=lambda *_: None,
             topics=RosTopicList,
         )
-        self._pair = _ReplayedPair(config.pairs[0], config, context)
+        self._pairs = [_ReplayedPair(pair, config, context) for pair in config.pairs]
+        lidars = LidarPairs(config.lidar_edges, self._vehicle, workers_in_place)
+        lidars.grow(config.pairs)
+        self._receivers: tuple[_ReplayedPair | LidarPairStream, ...] = (*self._pairs, *lidars.streams)
 
-    def run(self, frames: Iterator[Frame], on_frame: Callable[[int], None]) -> ReplayedDrive:
-        """Has the engine take all frames. `on_frame(stamp_ns)` is called for each image.
+    @property
+    def rig(self) -> RigSnapshot:
+        """What is known of the rig."""
+        return self._vehicle.rig.snapshot
+
+    def run(self, frames: Mapping[str, Iterator[Frame]], on_frame: Callable[[int], None]) -> dict[str, ReplayedDrive]:
+        """Has the engine take all frames, given in ascending order by the names of the pairs; those of a sensor of
+        several pairs are taken from the first. `on_frame(stamp_ns)` is called for each image.
+
+        Returns:
+            By the names of the pairs.
 
         Raises:
             SourceError: a worker cannot be used, or a frame cannot be read.
@@ -274,27 +305,38 @@ class DriveReplay:
         begin_ns = self._clock.stamp_ns
         with self._running(), self._workers.running():
             started_s = time.monotonic()
-            for frame in read_ahead(frames, READ_AHEAD_BYTES):
+            for number, frame in read_ahead(self._merged(frames), READ_AHEAD_BYTES):
                 self._clock.stamp_ns = max(self._clock.stamp_ns, frame.stamp_ns)
-                sensor = self._pair.sensors.get(stream_of(frame))
-                if sensor is not None:
-                    self._vehicle.inbox.put(sensor.number, InputSample(b"", MSGPACK, frame=frame))
+                self._vehicle.inbox.put(number, InputSample(b"", MSGPACK, frame=frame))
                 self._settle()
                 if isinstance(frame, CameraFrame):
                     on_frame(frame.stamp_ns)
-            end_ns, health = self._clock.stamp_ns, self._pair.engine.store.state.health.value
+            end_ns = self._clock.stamp_ns
+            healths = [pair.engine.store.state.health.value for pair in self._pairs]
             self._finish()
             elapsed_s = time.monotonic() - started_s
-        store = self._pair.engine.store
-        return ReplayedDrive(
-            decisions_of(PairRecords(store.history.entries(), store.checks(), ())),
-            tuple(self._pair.transitions),
-            self._pair.stream.losses(),
-            health,
-            begin_ns,
-            end_ns,
-            elapsed_s,
-        )
+        return {
+            pair.name: ReplayedDrive(
+                decisions_of(PairRecords(pair.engine.store.history.entries(), pair.engine.store.checks(), ())),
+                tuple(pair.transitions),
+                pair.stream.losses(),
+                health,
+                begin_ns,
+                end_ns,
+                elapsed_s,
+            )
+            for pair, health in zip(self._pairs, healths, strict=True)
+        }
+
+    def _merged(self, frames: Mapping[str, Iterator[Frame]]) -> Iterator[StreamFrame]:
+        """All frames in the order of their stamps, each stream once."""
+        merged: list[Iterator[StreamFrame]] = []
+        known: set[str] = set()
+        for pair in self._pairs:
+            numbers = {kind: sensor.number for kind, sensor in pair.sensors.items() if sensor.number not in known}
+            known.update(numbers.values())
+            merged.append(_numbered(frames[pair.name], numbers))
+        return heapq.merge(*merged, key=lambda entry: entry[1].stamp_ns)
 
     @contextmanager
     def _running(self) -> Iterator[None]:
@@ -312,30 +354,51 @@ class DriveReplay:
                 raise SourceError(f"The thread {thread.name} died: {thread.failure!r}.")
 
     def _settle(self) -> None:
-        """Has the engine do all that it may, and waits for the results that it waits for."""
-        pair = self._pair
-        while self._vehicle.turn(0.0) or pair.stream.held.pairs:
-            if not pair.stream.held.pairs:
+        """Has the engine do all that it may, and waits for the results that it waits for. What then waits for frames of
+        another pair is left."""
+        while True:
+            self._vehicle.turn(0.0)
+            if self._vehicle.is_busy:
                 continue
-            if pair.engine.oldest_request is not None and pair.engine.is_waiting:
-                self._deliver_oldest(pair.engine.oldest_request)
-            elif not pair.recorder.has_room:
+            if any(receiver.is_waiting and receiver.oldest_request is not None for receiver in self._receivers):
+                self._deliver_oldest(only_awaited=True)
+            elif any(pair.stream.held.pairs and not pair.recorder.has_room for pair in self._pairs):
                 time.sleep(POLL_S)  # the disk is slower than the replay
+            else:
+                return
 
     def _finish(self) -> None:
-        """The drive has ended: takes all results, and ends the open slice at its end, as silence would in the
+        """The drive has ended: takes all results, and ends the open slices at their ends, as silence would in the
         service."""
-        pair = self._pair
-        pair.stream.flush(self._clock.monotonic_s())
+        for pair in self._pairs:
+            pair.stream.flush(self._clock.monotonic_s())
         self._settle()
-        while pair.engine.oldest_request is not None or pair.engine.selector.slice_end_ns is not None:
-            pair.end_slice()
-            if pair.engine.oldest_request is not None:
-                self._deliver_oldest(pair.engine.oldest_request)
+        if any(pair.stream.held.pairs for pair in self._pairs):  # which wait for pairs that have ended
+            self._clock.stamp_ns += self._silence_ns
             self._settle()
+        while any(receiver.oldest_request is not None for receiver in self._receivers) or any(
+            pair.engine.selector.slice_end_ns is not None for pair in self._pairs
+        ):
+            for pair in self._pairs:
+                pair.end_slice()
+            self._deliver_oldest(only_awaited=False)
+            self._settle()
+        self._vehicle.finish()
 
-    def _deliver_oldest(self, request: messages.PairRequest) -> None:
-        self._vehicle.deliver(request.subject if isinstance(request.subject, messages.WindowSubject) else request)
+    def _deliver_oldest(self, *, only_awaited: bool) -> None:
+        """Waits for the result that counts first, of those that a receiver waits for or of all."""
+        requests = [
+            receiver.oldest_request
+            for receiver in self._receivers
+            if receiver.oldest_request is not None and (receiver.is_waiting or not only_awaited)
+        ]
+        if requests:
+            request = min(requests, key=lambda one: one.due_ns)
+            self._vehicle.deliver(request.subject if isinstance(request.subject, messages.WindowSubject) else request)
+
+
+def _numbered(frames: Iterator[Frame], numbers: Mapping[str, str]) -> Iterator[StreamFrame]:
+    return ((numbers[stream_of(frame)], frame) for frame in frames if stream_of(frame) in numbers)
 
 
 def _event_text(event: messages.Event) -> str:

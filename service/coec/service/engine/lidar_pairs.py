@@ -216,6 +216,16 @@ class LidarPairStream:
         """Number of registrations that were requested and have no result."""
         return self._schedule.unanswered
 
+    @property
+    def oldest_request(self) -> RegistrationRequest | None:
+        """The request whose result is to be concluded next; None if there is none."""
+        return self._schedule.oldest
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a result that counts by the newest sweep is missing."""
+        return self._sampler.latest_ns is not None and self._schedule.waits(self._sampler.latest_ns)
+
     # --- frames -----------------------------------------------------------------------------------------------------
 
     def taker(self, name: str) -> Taker:
@@ -353,6 +363,7 @@ class LidarPairs:
     """The edges between all LiDARs of a vehicle. For the main thread.
 
     Attributes:
+        streams: registrations of the LiDARs that can be registered.
         problem: why no LiDARs are registered, if people can change that; else None.
     """
 
@@ -361,6 +372,7 @@ class LidarPairs:
         self._vehicle = vehicle
         self._worker = worker
         self._names: set[str] = set()
+        self.streams: list[LidarPairStream] = []
         self.problem: Reason | None = None
 
     def grow(self, pairs: Iterable[PairConfig]) -> None:
@@ -376,7 +388,7 @@ class LidarPairs:
             self._names.add(lidars.edge.name)
             why_not = lidars.why_not
             if why_not is None:
-                LidarPairStream(lidars, self._period_s, self._vehicle, self._worker)
+                self.streams.append(LidarPairStream(lidars, self._period_s, self._vehicle, self._worker))
                 continue
             self._vehicle.rig.join_lidars(LidarPairStatus(lidars.edge, LidarState.NOT_MEASURED, (why_not,)))
             if why_not is NOT_INSTALLED:
