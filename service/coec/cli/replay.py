@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -216,25 +217,27 @@ def _recording_of(source: str, pair: PairConfig, *, alone: bool) -> RecordingSou
     """
     from coec.io.recordings.layouts import open_source
 
-    of_pair = _with_topics(source, pair)
-    if of_pair is None and not alone:
-        raise UsageError(
-            f"a rig is replayed from a bag and topics (`camera.topic`, `lidar.topic`): {source} is no bag, or pair "
-            f"{pair.name} has none; name one pair with --pair"
-        )
-    if not alone:
-        return open_source(str(of_pair))
-    try:
-        return open_source(source)
-    except SourceError:
-        if of_pair is None:
-            raise
-        return open_source(of_pair)
+    with TemporaryDirectory() as folder:
+        of_pair = _with_topics(source, pair, Path(folder))
+        if not alone:
+            if of_pair is None:
+                raise UsageError(
+                    f"a rig is replayed from a bag and topics (`camera.topic`, `lidar.topic`): {source} is no bag, or "
+                    f"pair {pair.name} has none; name one pair with --pair"
+                )
+            return open_source(of_pair)
+        try:
+            return open_source(source)
+        except SourceError:
+            if of_pair is None:
+                raise
+            return open_source(of_pair)
 
 
-def _with_topics(source: str, pair: PairConfig) -> str | None:
-    """A bag of several cameras or LiDARs, with the topics of a pair where the query names none; None for every other
-    source, and for a pair without topics."""
+def _with_topics(source: str, pair: PairConfig, folder: Path) -> str | None:
+    """A bag of several cameras or LiDARs, with the topics of a pair and its nominal calibration, which is written into
+    `folder`, where the query names none; None for every other source, and for a pair without topics."""
+    import json
     from urllib.parse import urlencode
 
     from coec.io.recordings.recording_source import is_bag, parse_spec
@@ -244,14 +247,16 @@ def _with_topics(source: str, pair: PairConfig) -> str | None:
     topics = {key: stream.topic for key, stream in streams.items() if stream.topic and key not in spec.query}
     if not is_bag(spec) or not topics:
         return None
+    if "intrinsics" not in spec.query:
+        nominal = {"camera": pair.camera.intrinsics.model_dump(mode="json"), "T_camera_lidar": pair.T_camera_lidar}
+        topics["intrinsics"] = str(folder / "nominal.yaml")
+        Path(topics["intrinsics"]).write_text(json.dumps(nominal), encoding="utf-8")
     return f"{source}{'&' if spec.query else '?'}{urlencode(topics, safe='/')}"
 
 
 def _replay_drive(
     recordings: Mapping[str, RecordingSource], config: Config, begin_s: float, until_s: float | None
 ) -> tuple[dict[str, ReplayedDrive], RigReply]:
-    from tempfile import TemporaryDirectory
-
     from coec.service.api.rig_answers import reply_of
     from coec.service.drive_replay import DriveReplay
 
@@ -321,6 +326,8 @@ def _table(drives: Mapping[str, ReplayedDrive], first_ns: int) -> None:
     from coec.service.decision_log import outline
 
     for name, drive in drives.items():
+        if len(drives) > 1:
+            console.show(name, "bold")
         checks = [one for one in drive.decisions if one.kind == "check"]
         windows = [one for one in drive.decisions if one.kind == "estimate"]
         table = console.table("s", "decision", "", "")
@@ -328,10 +335,9 @@ def _table(drives: Mapping[str, ReplayedDrive], first_ns: int) -> None:
             table.add_row(line.time, line.kind, line.name, line.text)
         console.out.print(table)
         lost = sum(drive.losses.values())
-        of_pair = "" if len(drives) == 1 else f"{name}: "
         console.show(
-            f"{of_pair}{count(len(checks), 'check')}, {count(len(windows), 'window')}, "
-            f"{count(lost, 'loss', 'losses')}, {drive.health} at the end"
+            f"{count(len(checks), 'check')}, {count(len(windows), 'window')}, {count(lost, 'loss', 'losses')}, "
+            f"{drive.health} at the end"
         )
     pace = drive.driven_s / max(drive.elapsed_s, 1e-9)
     console.show(f"{drive.driven_s:.0f} s of driving in {drive.elapsed_s:.0f} s ({pace:.1f} times as fast)")

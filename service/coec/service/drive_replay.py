@@ -18,7 +18,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from math import ceil
 from pathlib import Path
 from typing import cast
 
@@ -262,7 +261,6 @@ class DriveReplay:
         budget = BudgetConfig(cores=MOST_CORES)
         config = config.model_copy(update={"state": state, "budget": budget, "log": log, "worker": worker})
         self._clock = DriveClock(first_ns)
-        self._silence_ns = ceil((worker.timeout_s + 1.0) * NS_PER_S)
         self._workers = _ReplayWorkers(config, workers)
         self._disk_writer = DiskWriter(folder)
         self._recording = RecordingThread()
@@ -361,7 +359,7 @@ class DriveReplay:
             if self._vehicle.is_busy:
                 continue
             if any(receiver.is_waiting and receiver.oldest_request is not None for receiver in self._receivers):
-                self._deliver_oldest(only_awaited=True)
+                self._deliver_oldest(blocking_only=True)
             elif any(pair.stream.held.pairs and not pair.recorder.has_room for pair in self._pairs):
                 time.sleep(POLL_S)  # the disk is slower than the replay
             else:
@@ -373,24 +371,23 @@ class DriveReplay:
         for pair in self._pairs:
             pair.stream.flush(self._clock.monotonic_s())
         self._settle()
-        if any(pair.stream.held.pairs for pair in self._pairs):  # which wait for pairs that have ended
-            self._clock.stamp_ns += self._silence_ns
-            self._settle()
+        for pair in self._pairs:
+            pair.finish_pairs()  # which waited for pairs that have ended
         while any(receiver.oldest_request is not None for receiver in self._receivers) or any(
             pair.engine.selector.slice_end_ns is not None for pair in self._pairs
         ):
             for pair in self._pairs:
                 pair.end_slice()
-            self._deliver_oldest(only_awaited=False)
+            self._deliver_oldest(blocking_only=False)
             self._settle()
         self._vehicle.finish()
 
-    def _deliver_oldest(self, *, only_awaited: bool) -> None:
+    def _deliver_oldest(self, *, blocking_only: bool) -> None:
         """Waits for the result that counts first, of those that a receiver waits for or of all."""
         requests = [
             receiver.oldest_request
             for receiver in self._receivers
-            if receiver.oldest_request is not None and (receiver.is_waiting or not only_awaited)
+            if receiver.oldest_request is not None and (receiver.is_waiting or not blocking_only)
         ]
         if requests:
             request = min(requests, key=lambda one: one.due_ns)
