@@ -1,10 +1,13 @@
 """A recording without ego-motion: it is measured from its own sweeps."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 
 from coec.calibration.frames.motion_compensation import compensation, sensor_twist
-from coec.calibration.types import Compensation
+from coec.calibration.types import Compensation, LidarFrame
+from coec.errors import SourceError
 from coec.io import nearest_neighbours
 from coec.io.recordings.window_cutting import LoadedWindow, window_of_recording
 from support.simulated_drives import rendered_source
@@ -46,6 +49,22 @@ def test_without_the_extra_the_report_names_it(monkeypatch: pytest.MonkeyPatch) 
     assert note.code == "motion_unknown"
     assert "coec[lidars]" in note.text
     assert all(pair.motion is None for pair in window.window.pairs)
+
+
+@with_search
+def test_damaged_neighbours_leave_the_motion_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = rendered_source(WITHOUT)
+
+    def damaged(_: object) -> Iterator[LidarFrame]:
+        raise SourceError("none of 2 clouds can be read")
+        yield
+
+    monkeypatch.setattr(type(recording), "sweeps", lambda _, stamps_ns: damaged(stamps_ns))
+    window = window_of_recording(recording, 2, lambda *_: None)
+    (note,) = window.recognitions
+    assert note.code == "motion_unknown"
+    assert "Record the odometry" in note.text
+    assert [pair.motion for pair in window.window.pairs] == [None, None]
 
 
 def test_frames_in_two_second_steps_show_no_motion() -> None:

@@ -23,13 +23,14 @@ from coec.calibration.types import (
     CameraFrame,
     Frame,
     FramePair,
+    LidarFrame,
     Matrix4,
     Recognition,
     Rig,
     Window,
 )
 from coec.config import CalibrationConfig, Config, LimitsConfig, PairingConfig, WindowConfig
-from coec.errors import DecodeError, SourceError, UsageError
+from coec.errors import DecodeError, MisreadError, SourceError, UsageError
 from coec.geometry import se3
 from coec.geometry.cameras import Camera
 from coec.geometry.projection import half_field_of_view_rad
@@ -177,7 +178,13 @@ def _with_motion(
             "(pip install 'coec[lidars]') it is measured from sweep to sweep."
         )
         return rig, pairs, (Recognition("motion_unknown", text, "warn"),)
-    sweeps = {sweep.stamp_ns: sweep for sweep in recording.sweeps(known)}
+    sweeps: dict[int, LidarFrame] = {}
+    try:
+        sweeps.update((sweep.stamp_ns, sweep) for sweep in recording.sweeps(known))
+    except MisreadError:
+        raise
+    except SourceError:
+        pass  # every one is damaged, and counted as such
     consecutive = [
         (first, second) if first.stamp_ns < second.stamp_ns else (second, first)
         for pair, stamp_ns in zip(pairs, neighbours, strict=True)
@@ -185,6 +192,12 @@ def _with_motion(
     ]
     motions = list(motions_of_sweeps(consecutive, rig.sweep, nearest_neighbours.Trees()))
     measured = sum(motion is not None for motion in motions)
+    if not measured:
+        text = (
+            "No ego-motion is recorded, and registering sweeps determines none: sweeps taken while driving are not "
+            "compensated. Record the odometry."
+        )
+        return rig, pairs, (Recognition("motion_unknown", text, "warn"),)
     text = f"No ego-motion is recorded: it is measured by registering sweeps, for {measured} of {len(pairs)} pairs."
     moving = [replace(pair, motion=motion) for pair, motion in zip(pairs, motions, strict=True)]
     known_motions = [motion for motion in motions if motion is not None]
