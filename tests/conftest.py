@@ -107,6 +107,19 @@ def _file_order(path: Path) -> int:
     return next(turns, len(LONGEST_FIRST))
 
 
+@pytest.fixture(scope="session", autouse=True)
+def one_thread_a_worker() -> Iterator[None]:
+    """Kernels of a parallel run have one thread: those of several processes on the same cores wait for each other,
+    which takes a third of the processor time."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        yield
+        return
+    from coec.geometry.compiler import on_one_thread  # numba, which a single test may do without
+
+    with on_one_thread():
+        yield
+
+
 @pytest.fixture(scope="session")
 def sample_data() -> Path:
     """The folder of the sample recordings: $COEC_SAMPLE_DATA, else ../shared/data beside the checkout.

@@ -60,9 +60,10 @@ LOG_SHOWN = 8000
 
 
 def environment() -> dict[str, str]:
-    """That of this process, with the package on its path."""
+    """That of this process, with the package on its path; kernels have one thread there, too, in a parallel run."""
     path = os.pathsep.join(filter(None, [str(REPOSITORY / "service"), os.environ.get("PYTHONPATH")]))
-    return {**os.environ, "PYTHONPATH": path}
+    threads = {"NUMBA_NUM_THREADS": "1"} if "PYTEST_XDIST_WORKER" in os.environ else {}
+    return {**threads, **os.environ, "PYTHONPATH": path}
 
 
 @contextmanager

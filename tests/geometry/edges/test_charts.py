@@ -225,7 +225,7 @@ def test_the_order_of_the_points_does_not_matter_to_the_bit() -> None:
 def threads() -> Iterator[tuple[int, ...]]:
     """One thread, and as many as there are; afterwards it is as before."""
     before = numba.get_num_threads()
-    yield (1, before)
+    yield (1, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     numba.set_num_threads(before)
 
 
