@@ -271,9 +271,9 @@ def _replay_drive(
     if begin_ns > min(end_ns, last_ns):
         raise UsageError(f"no camera frame lies between --from and --until: {name} is shorter")
 
-    def frames(recording: RecordingSource) -> Iterator[Frame]:
+    def frames(recording: RecordingSource, kinds: tuple[str, ...]) -> Iterator[Frame]:
         # Motion before the first image and after the last one belongs to them.
-        for frame in recording.messages():
+        for frame in recording.messages(kinds=kinds):
             if until_s is not None and frame.stamp_ns > end_ns:
                 return
             if begin_s == 0.0 or frame.stamp_ns >= begin_ns:
@@ -284,7 +284,7 @@ def _replay_drive(
         # A second worker only helps if reading and the engine leave it a core.
         workers = 2 if len(os.sched_getaffinity(0)) > 2 else 1
         drive = DriveReplay(config, Path(folder), begin_ns, workers)
-        streams = {name: frames(recording) for name, recording in recordings.items()}
+        streams = {name: frames(recording, drive.kinds[name]) for name, recording in recordings.items()}
         drives = drive.run(streams, lambda stamp_ns: bars.update(task, completed=(stamp_ns - begin_ns) / NS_PER_S))
         return drives, reply_of(config.vehicle, drive.rig)
 

@@ -26,6 +26,7 @@ from coec.calibration.types import NS_PER_S, CameraFrame, Frame
 from coec.config import BudgetConfig, Config, PairConfig
 from coec.errors import SourceError
 from coec.io.disk_writer import DiskWriter
+from coec.io.recordings.recording_source import CLOUD, IMAGE, MOTION
 from coec.io.zenoh.bus import MSGPACK, InputSample
 from coec.io.zenoh.player import stream_of
 from coec.io.zenoh.ros_node import RosTopicList
@@ -38,6 +39,7 @@ from coec.service.engine import messages
 from coec.service.engine.lidar_pairs import LidarPairs, LidarPairStream
 from coec.service.engine.rig import RigEstimator, RigSnapshot
 from coec.service.engine.vehicle import Vehicle
+from coec.service.ingest.decoder import CAMERA, EGO, LIDAR
 from coec.service.ingest.pair_stream import frame_bytes
 from coec.service.process_lifetime import joined
 from coec.service.recording.recorder import RecordBetween, RecordingThread, RecordPair
@@ -283,6 +285,12 @@ class DriveReplay:
         self._pairs = [_ReplayedPair(pair, config, context) for pair in config.pairs]
         lidars = LidarPairs(config.lidar_edges, self._vehicle, workers_in_place)
         lidars.grow(config.pairs)
+        self._numbers: dict[str, dict[str, str]] = {}
+        for pair in self._pairs:
+            known = {number for of_pair in self._numbers.values() for number in of_pair.values()}
+            self._numbers[pair.name] = {
+                kind: sensor.number for kind, sensor in pair.sensors.items() if sensor.number not in known
+            }
         self._receivers: tuple[_ReplayedPair | LidarPairStream, ...] = (*self._pairs, *lidars.streams)
 
     @property
@@ -290,9 +298,16 @@ class DriveReplay:
         """What is known of the rig."""
         return self._vehicle.rig.snapshot
 
+    @property
+    def kinds(self) -> dict[str, tuple[str, ...]]:
+        """By the name of each pair, the kinds of frames (see `Recording.messages`) that it has to provide: those of a
+        sensor of several pairs come from the first."""
+        of_stream = {CAMERA: IMAGE, LIDAR: CLOUD, EGO: MOTION}
+        return {pair: tuple(of_stream[kind] for kind in numbers) for pair, numbers in self._numbers.items()}
+
     def run(self, frames: Mapping[str, Iterator[Frame]], on_frame: Callable[[int], None]) -> dict[str, ReplayedDrive]:
-        """Has the engine take all frames, given in ascending order by the names of the pairs; those of a sensor of
-        several pairs are taken from the first. `on_frame(stamp_ns)` is called for each image.
+        """Has the engine take all frames, given in ascending order by the names of the pairs; others than those of
+        `kinds` are left out. `on_frame(stamp_ns)` is called for each image.
 
         Returns:
             By the names of the pairs.
@@ -328,13 +343,8 @@ class DriveReplay:
 
     def _merged(self, frames: Mapping[str, Iterator[Frame]]) -> Iterator[StreamFrame]:
         """All frames in the order of their stamps, each stream once."""
-        merged: list[Iterator[StreamFrame]] = []
-        known: set[str] = set()
-        for pair in self._pairs:
-            numbers = {kind: sensor.number for kind, sensor in pair.sensors.items() if sensor.number not in known}
-            known.update(numbers.values())
-            merged.append(_numbered(frames[pair.name], numbers))
-        return heapq.merge(*merged, key=lambda entry: entry[1].stamp_ns)
+        numbered = (_numbered(frames[pair], numbers) for pair, numbers in self._numbers.items())
+        return heapq.merge(*numbered, key=lambda entry: entry[1].stamp_ns)
 
     @contextmanager
     def _running(self) -> Iterator[None]:

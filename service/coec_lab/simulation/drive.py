@@ -21,7 +21,7 @@ from coec.calibration.types import Frame, LidarFrame, Matrix4, Rig
 from coec.errors import UsageError
 from coec.geometry.cameras import Camera, build, intrinsics_of, name_of
 from coec.geometry.se3 import inverse, perturb
-from coec.io.recordings.recording_source import MOTION_REACH_NS, selected_indices
+from coec.io.recordings.recording_source import KINDS, MOTION_REACH_NS, selected_indices
 from coec_lab.simulation import simulated_sensors
 from coec_lab.simulation.faults import Fault, shifted
 from coec_lab.simulation.journey import START_NS, Journey
@@ -221,10 +221,10 @@ class SimulatedDrive:
         """True T_world_ego (4, 4) at a time."""
         return self._journey.pose(seconds_of(stamp_ns))
 
-    def messages(self, cameras: Collection[int] | None = None) -> Iterator[Frame]:
+    def messages(self, cameras: Collection[int] | None = None, kinds: Collection[str] = KINDS) -> Iterator[Frame]:
         """See `Recording.messages`."""
         required = self._plan if cameras is None else needed(self._plan, cameras, _CAMERA, _LIDAR, _EGO)
-        return map(self._message, required)
+        return (self._message(entry) for entry in required if KINDS[entry.stream] in kinds)
 
     def sweeps(self, stamps_ns: Collection[int]) -> Iterator[LidarFrame]:
         """See `Recording.sweeps`."""

@@ -26,6 +26,7 @@ from coec.config import PairingConfig
 from coec.errors import UsageError
 from coec.geometry.cameras import Camera
 from coec.geometry.se3 import inverse, perturb, rotation_exp
+from coec.io.recordings.recording_source import CLOUD, IMAGE, KINDS, MOTION
 from coec_lab.simulation import simulated_sensors
 from coec_lab.simulation.drive import Arrival, arrivals, camera_of, check_rates, lidar_of, needed, seconds_of, stamps_of
 from coec_lab.simulation.faults import Fault, SensorFault, shifted
@@ -352,10 +353,12 @@ class SimulatedRigPair:
         T_lidar_ego = self._drive.T_sensor_ego(self._lidar, stamp_ns)
         return simulated_sensors.product(self._drive.T_sensor_ego(self._camera, stamp_ns), inverse(T_lidar_ego))
 
-    def messages(self, cameras: Collection[int] | None = None) -> Iterator[Frame]:
+    def messages(self, cameras: Collection[int] | None = None, kinds: Collection[str] = KINDS) -> Iterator[Frame]:
         """See `Recording.messages`."""
-        streams = (self._drive.stream(name) for name in (self._camera, self._lidar, EGO))
-        return map(self._drive.message, self._plan if cameras is None else needed(self._plan, cameras, *streams))
+        streams = [self._drive.stream(name) for name in (self._camera, self._lidar, EGO)]
+        required = self._plan if cameras is None else needed(self._plan, cameras, *streams)
+        loaded = {stream for stream, kind in zip(streams, (IMAGE, CLOUD, MOTION), strict=True) if kind in kinds}
+        return (self._drive.message(entry) for entry in required if entry.stream in loaded)
 
     def sweeps(self, stamps_ns: Collection[int]) -> Iterator[LidarFrame]:
         """See `Recording.sweeps`."""

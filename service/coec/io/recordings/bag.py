@@ -266,7 +266,7 @@ class BagRecording:
         """See `Recording`."""
         return tuple(motion.stamp_ns for motion in self.streams.motions)
 
-    def messages(self, cameras: Collection[int] | None = None) -> Iterator[Frame]:
+    def messages(self, cameras: Collection[int] | None = None, kinds: Collection[str] = KINDS) -> Iterator[Frame]:
         """See `Recording.messages`. With chosen camera frames, only the sweep nearest to each of them comes. The origin
         of the first sweep of each second is checked."""
         selected = [
@@ -285,6 +285,7 @@ class BagRecording:
             (item.stamp_ns, kind, number, item)
             for kind, items in ((_EGO, motions), (_LIDAR, sweeps), (_CAMERA, selected))
             for number, item in enumerate(items)
+            if KINDS[kind] in kinds
         ]
         checked: LidarFrame | None = None
         with self.storage.open() as reader:

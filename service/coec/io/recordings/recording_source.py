@@ -132,12 +132,13 @@ class RecordingSource(Protocol):
     def motion_stamps_ns(self) -> tuple[int, ...]:
         """Stamps of the ego-motion, ascending, nanoseconds; empty if there is none."""
 
-    def messages(self, cameras: Collection[int] | None = None) -> Iterator[Frame]:
+    def messages(self, cameras: Collection[int] | None = None, kinds: Collection[str] = KINDS) -> Iterator[Frame]:
         """Messages in ascending order of their stamps, each loaded when it is its turn.
 
         Args:
             cameras: indices into `camera_stamps_ns`: only these camera frames, and the sweeps and ego-motion that are
                 needed to pair them. None: everything.
+            kinds: only messages of these `KINDS` are loaded.
 
         Raises:
             UsageError: an index is out of range.
@@ -236,7 +237,7 @@ class FramewiseRecording:
         """See `Recording`."""
         return tuple(motion.stamp_ns for motion in self.motions)
 
-    def messages(self, cameras: Collection[int] | None = None) -> Iterator[Frame]:
+    def messages(self, cameras: Collection[int] | None = None, kinds: Collection[str] = KINDS) -> Iterator[Frame]:
         """See `Recording.messages`."""
         frames = [self.frames[index] for index in selected_indices(cameras, len(self.frames))]
         stamps_ns = [frame.camera_stamp_ns for frame in frames]
@@ -247,7 +248,7 @@ class FramewiseRecording:
             queue.append((frame.camera_stamp_ns, _CAMERA, place, frame.load_camera))
         for place, motion in enumerate(motions):
             queue.append((motion.stamp_ns, _EGO, place, lambda motion=motion: motion))  # type: ignore[misc]
-        ordered = sorted(queue, key=lambda entry: entry[:3])
+        ordered = sorted((entry for entry in queue if KINDS[entry[1]] in kinds), key=lambda entry: entry[:3])
         yield from self.damaged.sound((KINDS[kind], stamp_ns, load) for stamp_ns, kind, _, load in ordered)
 
     def sweeps(self, stamps_ns: Collection[int]) -> Iterator[LidarFrame]:
