@@ -71,6 +71,7 @@ def test_the_source_archive_holds_every_file_under_version_control(sdist: Path) 
     assert held - listed(*WITH_NEW) == {"PKG-INFO"}, "nothing else of the folder gets into it"
 
 
-def test_the_same_sources_give_the_same_bytes(wheel: Path, sdist: Path, tmp_path: Path) -> None:
-    for archive, target in ((wheel, "wheel"), (sdist, "sdist")):
-        assert built(target, tmp_path / target).read_bytes() == archive.read_bytes()
+@pytest.mark.parametrize("target", ["wheel", pytest.param("sdist", marks=pytest.mark.slow)])
+def test_the_same_sources_give_the_same_bytes(target: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    archive: Path = request.getfixturevalue(target)
+    assert built(target, tmp_path / target).read_bytes() == archive.read_bytes()

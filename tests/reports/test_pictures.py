@@ -16,14 +16,12 @@ from coec.reports.page import Compare, Pictures, Text
 from coec.reports.pictures import Comparison, write_comparison
 from support import scenes
 
-WINDOW = scenes.post_window((-8.0, 8.0))
-WINDOW = replace(WINDOW, pairs=WINDOW.pairs * 4)
-
 
 def rendered(folder: Path, observations: float | None) -> Comparison:
-    truth = WINDOW.T_camera_lidar_start
+    window = scenes.post_window((-8.0, 8.0))
+    window, truth = replace(window, pairs=window.pairs * 4), window.T_camera_lidar_start
     moved = se3.perturb(truth, np.array([0.0, radians(0.5), 0.0, 0.0, 0.0, 0.0]))
-    return write_comparison(folder, WINDOW, moved, truth, Caption("start", "result"), True, observations)
+    return write_comparison(folder, window, moved, truth, Caption("start", "result"), True, observations)
 
 
 @pytest.mark.parametrize("observations", [None, 4.0, 2.0])

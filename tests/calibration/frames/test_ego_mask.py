@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 
 from coec.calibration.frames.ego_mask import GRID_WIDTH, MIN_FRAMES, DeadRegions, lit_pixels
 from coec.calibration.solver import prepare_window_data
-from coec.calibration.types import DepthModel, Silence, Window
+from coec.calibration.types import CameraFrame, DepthModel, Silence, Window
 from coec.config import CalibrationConfig, LimitsConfig
 from coec.io.images import GreyImages
 from coec.io.recordings import window_cutting
+from coec.io.recordings.layouts import open_source
+from coec.io.recordings.recording_source import IMAGE
 from support import degradations
 
 Grey = NDArray[np.uint8]
@@ -232,8 +234,9 @@ def test_a_bonnet_painted_over_the_street_is_masked(sharp_street: Window, stereo
 
 # ----------------------------------------------------------------------------------------------------- recordings
 def recorded(source: str) -> list[Grey]:
-    window = window_cutting.load_window(source, None, 25, lambda *_: None).window
-    return [GREY.grey(pair.camera) for pair in window.pairs]
+    return [
+        GREY.grey(frame) for frame in open_source(source).messages(None, (IMAGE,)) if isinstance(frame, CameraFrame)
+    ]
 
 
 @pytest.mark.parametrize("camera", ["image_00", "image_01"])

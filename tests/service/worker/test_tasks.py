@@ -59,7 +59,7 @@ print(len(warm), sorted(used - warm), "|", sorted(kernels() - used))
 
 def test_no_calibration_waits_for_a_kernel_after_the_warm_up() -> None:
     """In a process of its own: in this one, other tests have run them all."""
-    env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "NUMBA_NUM_THREADS": "1"}
     done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, env=env, check=False)
     assert done.returncode == 0, done.stderr
     warm, reported = done.stdout.split(maxsplit=1)
