@@ -169,7 +169,7 @@ def test_assessment_as_text(coec: Coec) -> None:
 @pytest.mark.parametrize(
     ("model", "source", "suitability", "rank"),
     [
-        ("stereo", "kitti360:{}/kitti360?camera=image_00", "good", 0.90),
+        pytest.param("stereo", "kitti360:{}/kitti360?camera=image_00", "good", 0.90, marks=pytest.mark.slow),
         ("tcsmallnet_dyn.onnx", "kitti360:{}/kitti360?camera=image_00", "usable_in_fused", 0.90),
         ("meter_xxs_kitti_192x640.onnx", "{}/fisheye_garage/dataset.yaml", "do_not_use", 0.08),
     ],

@@ -44,7 +44,11 @@ def run(code: str, **environment: str) -> list[str]:
     return done.stdout.split()
 
 
-@pytest.mark.parametrize("entry", ENTRIES.values(), ids=ENTRIES)
+@pytest.mark.parametrize(
+    "entry",
+    [pytest.param(code, marks=pytest.mark.slow if code == "import coec" else ()) for code in ENTRIES.values()],
+    ids=ENTRIES,
+)
 def test_every_process_prefers_openmp_and_tries_tbb_last(entry: str) -> None:
     layer, *tried = run(f"{entry}\n{LAUNCH}")
     assert tried == ["omp", "workqueue", "tbb"]

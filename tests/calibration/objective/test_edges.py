@@ -72,7 +72,9 @@ def seen_blur_rad(camera: Camera) -> float:
     return float(np.linalg.norm(np.cross(rays[0], rays[1])))
 
 
-@pytest.mark.parametrize("lens", CAMERAS)
+@pytest.mark.parametrize(
+    "lens", [pytest.param(name, marks=pytest.mark.slow) if name in ("common", "huge") else name for name in CAMERAS]
+)
 def test_levels_double_and_end_at_the_same_angle_for_any_lens(street: Window, lens: str) -> None:
     camera = CAMERAS[lens]
     edges = with_camera(street, camera)

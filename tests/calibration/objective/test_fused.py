@@ -228,6 +228,12 @@ def test_depth_that_does_not_vary_with_the_pose_leaves_the_edges_to_decide(
 
 
 # ----------------------------------------------------------------------------------------------- the calibration
+@pytest.fixture(scope="module")
+def informed(few: Window, stereo: DepthModel) -> Estimate:
+    """From a start five degrees away, with depth that is right."""
+    return solve(from_start(few, 8, 5.0), stereo)
+
+
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_start_twenty_five_degrees_away_comes_back(few: Window, stereo: DepthModel, seed: int) -> None:
     estimate = solve(from_start(few, seed, 25.0), stereo)
@@ -282,10 +288,9 @@ def test_same_input_same_bits(few: Window, stereo: DepthModel) -> None:
 
 
 def test_a_network_without_information_does_not_lead_out_of_the_basin_of_the_edges(
-    few: Window, stereo: DepthModel
+    few: Window, informed: Estimate
 ) -> None:
-    start = from_start(few, 8, 5.0)
-    informed, uninformed = solve(start, stereo), solve(start, Noise())
+    uninformed = solve(from_start(few, 8, 5.0), Noise())
     separation = informed.optimum.T_camera_lidar @ se3.inverse(uninformed.optimum.T_camera_lidar)
     assert se3.rotation_angle_rad(separation) < SAME_BASIN_RAD
     # Walls and poles tell the yaw by their upright edges, which needs no depth.
@@ -345,8 +350,8 @@ def test_a_start_beyond_the_reach_of_the_truth_ends_at_the_rim_or_is_refused(few
     assert is_accounted_for(estimate)
 
 
-def test_the_verdict_reports_how_far_the_answer_stands_out(few: Window, stereo: DepthModel) -> None:
-    metrics = {metric.name: metric for metric in solve(from_start(few, 1, 5.0), stereo).verdict.metrics}
+def test_the_verdict_reports_how_far_the_answer_stands_out(informed: Estimate) -> None:
+    metrics = {metric.name: metric for metric in informed.verdict.metrics}
     limits = FUSED.verdict
     assert (metrics["edge_contrast"].limit, metrics["edge_contrast"].at_least) == (limits.min_edge_contrast, True)
     assert (metrics["runner_up"].limit, metrics["runner_up"].at_least) == (limits.max_runner_up, False)
