@@ -136,6 +136,53 @@ def test_a_wrong_pose_is_named_and_corrected(few: Window, code: str) -> None:
     assert mistakes.KINDS[code].advice in mistake.text
 
 
+def test_a_crop_that_is_missing_in_the_principal_point_is_named(few: Window) -> None:
+    right = approximate(few.rig)
+    cut_px = right.camera.width // 8
+    cropped = replace(right, mask=None, camera=right.camera._replace(width=right.camera.width - cut_px))
+    mistake = named(given(few, cropped), lambda grey: grey[:, cut_px:])
+    assert mistake is not None
+    assert mistake.code == mistakes.PRINCIPAL_POINT
+    assert mistake.camera.cx == pytest.approx(right.camera.cx - cut_px, abs=0.06 * right.camera.width)
+
+
+def test_a_pose_of_a_camera_that_is_not_turned_is_named(few: Window) -> None:
+    right = approximate(few.rig)
+    camera = right.camera
+    upright = camera._replace(
+        width=camera.height,
+        height=camera.width,
+        fx=camera.fy,
+        fy=camera.fx,
+        cx=camera.cy,
+        cy=camera.width - 1 - camera.cx,
+    )
+    mistake = named(given(few, replace(right, mask=None, camera=upright)), np.rot90)
+    assert mistake is not None
+    assert (mistake.code, mistake.camera) == (mistakes.TURNED_90, upright)
+
+
+def test_two_mistakes_at_once_are_named(few: Window) -> None:
+    right = approximate(few.rig)
+    mistake = named(given(few, wrong_pose(mistakes.INVERSE_POSE, right)), lambda grey: grey[::-1, ::-1])
+    assert mistake is not None
+    assert mistake.code == mistakes.INVERSE_POSE
+    for code in (mistakes.INVERSE_POSE, mistakes.TURNED_180):
+        assert mistakes.KINDS[code].advice in mistake.text
+
+
+@pytest.mark.parametrize("later", [1, -1])
+def test_images_that_are_listed_off_by_one_are_named(street: Window, later: int) -> None:
+    images = [pair.camera.image for pair in street.pairs]
+    shifted = tuple(
+        replace(pair, camera=replace(pair.camera, image=images[(index + later) % len(images)]))
+        for index, pair in enumerate(street.pairs)
+    )
+    mistake = named(given(replace(street, pairs=shifted), approximate(street.rig)))
+    assert mistake is not None
+    assert (mistake.code, mistake.correctable) == (mistakes.OFF_BY_ONE, False)
+
+
 @pytest.mark.parametrize("code", [mistakes.FOCAL_LENGTH, mistakes.IMAGE_SCALE, mistakes.CENTRE_SWAPPED])
 def test_a_wrong_lens_is_named_and_corrected(few: Window, code: str) -> None:
     mistake = named(given(few, wrong_lens(code, approximate(few.rig))))
@@ -245,6 +292,20 @@ def test_images_of_another_size_are_named_without_a_search(few: Window) -> None:
     assert "the images have 320 x 160 px, the intrinsics are for 640 x 320 px" in mistake.text
     assert mistake.camera.width == 320
     assert mistake.camera.fx == pytest.approx(few.rig.camera.fx / 2)
+
+
+def test_images_of_another_shape_are_named_without_a_search(few: Window) -> None:
+    mistake = named(few, lambda grey: grey[:, 80:])
+    assert mistake is not None
+    assert (mistake.code, mistake.correctable) == (mistakes.IMAGE_SIZE, False)
+    assert "the images have 560 x 320 px, the intrinsics are for 640 x 320 px" in mistake.text
+
+
+def test_a_principal_point_shows_the_size_of_the_image_without_edges(few: Window) -> None:
+    mistake = named(given(replace(few, pairs=few.pairs[:2]), wrong_lens(mistakes.IMAGE_SCALE, few.rig)))
+    assert mistake is not None
+    assert (mistake.code, mistake.correctable) == (mistakes.IMAGE_SCALE, True)
+    assert mistake.camera.fx == pytest.approx(few.rig.camera.fx, rel=1e-3)
 
 
 def test_a_real_street(sample_data: Path) -> None:

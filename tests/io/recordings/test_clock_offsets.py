@@ -63,6 +63,12 @@ def test_images_that_are_stamped_when_received_are_suspected() -> None:
     assert "stamped when it was received" in text(BEGIN_NS - 80_000_000, scale=10**6)
 
 
+def test_a_known_difference_of_sparse_frames_is_named() -> None:
+    cameras = [BEGIN_NS + round(1e9 * at_s) for at_s in (0.0, 12.3, 25.1, 36.4, 50.2, 61.0)]
+    assert "37.000 s ahead of the images (this is TAI - UTC" in clocks_text(cameras, [t + 37 * 10**9 for t in cameras])
+    assert "11.000 s behind" not in clocks_text(cameras[:2], [t + 37 * 10**9 for t in cameras[:2]])
+
+
 def streams(offset_s: float, seconds: int = 90, late_s: float = 0.0) -> tuple[list[int], list[int]]:
     cameras = [BEGIN_NS + k * 1_000_000_000 for k in range(seconds)]
     return cameras, [stamp + round(offset_s * 1e9) + 10_000_000 for stamp in cameras[round(late_s) :]]

@@ -31,21 +31,26 @@ from coec.calibration.search.mistakes import (
     COMPENSATED,
     FOCAL_LENGTH,
     IMAGE_SCALE,
+    IMAGE_SIZE,
     KINDS,
     LIDAR_AXES,
     MOTION_AXES,
+    OFF_BY_ONE,
+    OFF_MIDDLE,
     OTHER_AXES,
     QUARTER_TURN,
     TURNED_90,
     Supposition,
     changed,
+    off_middle,
     suppositions,
+    suppositions_of_two,
 )
 from coec.calibration.solver import WindowData
 from coec.calibration.types import FramePair, Matrix4, Mistake, Rig
 from coec.errors import CalibrationError
 from coec.geometry import se3
-from coec.geometry.cameras import pixel_rad, scaled
+from coec.geometry.cameras import Camera, pixel_rad, scaled
 from coec.geometry.edges.alignment import AscentStart, EdgeFrames, alignments, ascend, frame_alignment, significances
 from coec.geometry.edges.charts import moved_by, unit_ball
 from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, EdgeScales
@@ -114,9 +119,19 @@ NEAR_ZOOMS = (0.95, 0.97, 0.98, 0.99, 1.01, 1.02, 1.03, 1.05)
 SAME_ASPECT = 0.02
 """Relative difference of the aspect ratios of an image and of the same image in another size, at most."""
 
+OTHER_SIZE, ALIKE = 0.3, 0.1
+"""A principal point shows the size of the image if it is so far from the middle along both sides, as a share of half a
+side, and by the same factor but for this share."""
+
+CENTRED_ODDS = 100.0
+"""Prior odds of a principal point near the middle of the image against one that is `OFF_MIDDLE`."""
+
 GROSS = 0.7
 """A mistake is named only if the inputs as given are less significant than this share of it. What is a little off is
 the subject of the posterior. See docs/measured.md."""
+
+GROSS_OF_TWO = 0.5
+"""The same for two mistakes at once, of which there are many pairs."""
 
 SAME_RAD = radians(5.0)
 """Poses nearer than this are one explanation."""
@@ -168,6 +183,19 @@ class Edges:
         frames = EdgeFrames(camera, self.xyz_m, self.weight, self.first_point, maps)
         return frames.of_points(thinned(len(self.weight), points))
 
+    def repaired(self, later: int) -> "Edges":
+        """The edges of each sweep with the image that is so many pairs later; those at the end have none."""
+        count = len(self.detected) - abs(later)
+        sweeps, images = max(-later, 0), max(later, 0)
+        begin, end = self.first_point[sweeps], self.first_point[sweeps + count]
+        return Edges(
+            np.ascontiguousarray(self.xyz_m[:, begin:end]),
+            self.weight[begin:end],
+            self.first_point[sweeps : sweeps + count + 1] - begin,
+            tuple((level, maps[images : images + count]) for level, maps in self.maps),
+            self.detected[sweeps : sweeps + count],
+        )
+
 
 def probable_mistake(data: WindowData, solved: Matrix4 | None) -> Mistake | None:
     """The mistake in the inputs of a window that was refused; None if none is probable. `solved` (4, 4) is where the
@@ -178,36 +206,50 @@ def probable_mistake(data: WindowData, solved: Matrix4 | None) -> Mistake | None
     except CalibrationError:
         return None
     if edges is None:
-        return wrong_size
+        return wrong_size or _of_other_size(data.window.rig)
     of_clouds = _other_cloud_axes(data)
     if of_clouds is not None:
         return of_clouds
-    given, *ranked = _rank_suppositions(edges, data.window.rig, solved)
+    given = _of_given(edges, data.window.rig, solved)
+    ranked = _ranked(edges, suppositions(data.window.rig), given)
     late_s, timed = _other_time(data, edges, given)
-    best, *others = ranked or [given]
+    best, *_ = ranked or [given]
+    shifted = _other_pairing(data)
+    if shifted is not None and shifted.log_posterior > max(best.log_posterior, given.log_posterior) + log(LEAST_ODDS):
+        return _named(shifted, given)
     if timed is not None and timed.log_posterior > best.log_posterior:
         mistake = _named(timed, given)
         by = f"(the clouds {late_s:+.3f} s; of a bag, ?lidar_offset={late_s:.3f})"
         return replace(mistake, text=f"{mistake.text} {by}") if late_s else mistake
-    if best is given:
-        return None
-    rivals = [given.log_posterior, *(one.log_posterior for one in others if not _same_place(one, best))]
-    certain = best.log_posterior - float(np.logaddexp.reduce(rivals)) >= log(LEAST_ODDS)
-    return _named(best, given) if certain and given.significance <= GROSS * best.significance else None
+    if not _is_certain(ranked, given):
+        ranked = sorted(
+            [*ranked, *_ranked(edges, suppositions_of_two(data.window.rig), given)], key=lambda one: -one.log_posterior
+        )
+    return _named(ranked[0], given) if _is_certain(ranked, given) else _of_other_size(data.window.rig)
+
+
+def _is_certain(ranked: Sequence[Ranked], given: Ranked) -> bool:
+    """Whether the first, the most probable, is `LEAST_ODDS` more probable than all that put the camera elsewhere."""
+    share = GROSS_OF_TWO if ranked and ranked[0].supposition.also else GROSS
+    if not ranked or given.significance > share * ranked[0].significance:
+        return False
+    rivals = [given.log_posterior, *(one.log_posterior for one in ranked[1:] if not _same_place(one, ranked[0]))]
+    return ranked[0].log_posterior - float(np.logaddexp.reduce(rivals)) >= log(LEAST_ODDS)
 
 
 def _named(best: Ranked, given: Ranked) -> Mistake:
-    kind, supposition = KINDS[best.supposition.code], best.supposition
-    fit = f"with {kind.tried} the edges fit at {best.significance:.1f} sigma"
+    supposition = best.supposition
+    kinds = [KINDS[code] for code in (supposition.code, supposition.also) if code]
+    fit = f"with {' and '.join(kind.tried for kind in kinds)} the edges fit at {best.significance:.1f} sigma"
     return Mistake(
         supposition.code,
-        f"{fit} (as given: {max(given.significance, 0.0):.1f}): {kind.advice}",
+        f"{fit} (as given: {max(given.significance, 0.0):.1f}): {'; and '.join(kind.advice for kind in kinds)}",
         best.significance,
         given.significance,
         supposition.camera,
         supposition.T_camera_lidar,
         correctable=not supposition.mirrored
-        and supposition.code not in (BACKWARDS, MOTION_AXES, COMPENSATED, CLOCK_OFFSET),
+        and supposition.code not in (BACKWARDS, MOTION_AXES, COMPENSATED, CLOCK_OFFSET, OFF_BY_ONE),
     )
 
 
@@ -300,6 +342,27 @@ def _other_time(data: WindowData, edges: Edges, given: Ranked) -> tuple[float, R
     return best if best[1].log_posterior >= least else (0.0, None)
 
 
+def _other_pairing(data: WindowData) -> Ranked | None:
+    """Images that belong to the sweep of the pair before or after their own, as of files that are listed off by one;
+    None if that is not certain. Pairs in a row tell, of a vehicle that moves."""
+    pairs = data.window.pairs
+    first = max(0, (len(pairs) - FRAMES) // 2)
+    part = replace(data, window=replace(data.window, pairs=pairs[first : first + FRAMES]))
+    edges = _edges(part) if len(pairs) >= LEAST_TIMED else None
+    if edges is None:
+        return None
+    rig, ends = data.window.rig, []
+    for later in (0, 1, -1):
+        supposition = Supposition(OFF_BY_ONE if later else AS_GIVEN, rig.camera, rig.T_camera_lidar_nominal)
+        paired = edges.repaired(later)
+        end = _settled(paired, _local_ascent(paired, supposition, _screened(paired, supposition).starts))
+        odds = log(KINDS[OFF_BY_ONE].odds / AS_GIVEN_ODDS) if later else 0.0
+        ends.append(replace(end, log_posterior=end.log_posterior + odds))
+    given, best = ends[0], max(ends[1:], key=lambda end: end.log_posterior)
+    certain = best.log_posterior - given.log_posterior >= log(LEAST_ODDS)
+    return best if certain and given.significance <= GROSS * best.significance else None
+
+
 def _sweep_duration_s(data: WindowData) -> float:
     """The time from the first point of a sweep to its last; 0 if it is unknown."""
     times_s, sweep = data.window.pairs[0].lidar.time_offset_s, data.window.rig.sweep
@@ -337,24 +400,48 @@ def _wrong_size(data: WindowData) -> Mistake | None:
         return Mistake(TURNED_90, f"{sizes}: {KINDS[TURNED_90].advice}", nan, nan, camera, pose, correctable=False)
     across, down = width / camera.width, height / camera.height
     if abs(across / down - 1.0) > SAME_ASPECT:
-        return None
+        # Which it is, and at which side, no header says.
+        text = (
+            f"{sizes}: the images are probably cropped, or scaled by other factors across and down, and the intrinsics "
+            "are not: give those of the images as they are (of a crop, subtract what was cut from cx and cy)"
+        )
+        return Mistake(IMAGE_SIZE, text, nan, nan, camera, pose, correctable=False)
     fitting = scaled(camera, across, down)._replace(width=width, height=height)
     return Mistake(IMAGE_SCALE, f"{sizes}: {KINDS[IMAGE_SCALE].advice}", nan, nan, fitting, pose, correctable=True)
 
 
-def _rank_suppositions(edges: Edges, rig: Rig, solved: Matrix4 | None) -> list[Ranked]:
-    """The inputs as given, first, then as they would be without a mistake, the most probable first."""
-    screened = [_screened(edges, supposition) for supposition in suppositions(rig)]
-    given, *others = screened
-    starts = given.starts if solved is None else (*given.starts, solved)
-    of_given = _settled(edges, _local_ascent(edges, given.supposition, starts))
-    others = sorted(others, key=lambda one: -one.significance)[:ASCENDING]
-    ascended = [_local_ascent(edges, one.supposition, one.starts) for one in others]
+def _of_other_size(rig: Rig) -> Mistake | None:
+    """Intrinsics whose principal point is in the middle of an image of another size, though nothing fits better with
+    those of this one."""
+    camera, pose = rig.camera, rig.T_camera_lidar_nominal
+    across, down = (2.0 * camera.cx + 1.0) / camera.width, (2.0 * camera.cy + 1.0) / camera.height
+    if min(abs(across - 1.0), abs(down - 1.0)) < OTHER_SIZE or abs(across / down - 1.0) > ALIKE:
+        return None
+    right, below = (camera.cx + 0.5) / across - 0.5, (camera.cy + 0.5) / across - 0.5
+    fitting = changed(camera, fx=camera.fx / across, fy=camera.fy / across, cx=right, cy=below)
+    text = (
+        f"the principal point ({camera.cx:.0f}, {camera.cy:.0f}) is in the middle of an image {across:.2g} times as "
+        f"large as {camera.width} x {camera.height} px: {KINDS[IMAGE_SCALE].advice}"
+    )
+    return Mistake(IMAGE_SCALE, text, nan, nan, fitting, pose, correctable=True)
+
+
+def _of_given(edges: Edges, rig: Rig, solved: Matrix4 | None) -> Ranked:
+    """The inputs as given, wherever they fit best."""
+    screened = _screened(edges, Supposition(AS_GIVEN, rig.camera, rig.T_camera_lidar_nominal))
+    starts = screened.starts if solved is None else (*screened.starts, solved)
+    return _settled(edges, _local_ascent(edges, screened.supposition, starts))
+
+
+def _ranked(edges: Edges, tried: Sequence[Supposition], given: Ranked) -> list[Ranked]:
+    """The inputs as they would be without a mistake, the most probable first."""
+    screened = sorted((_screened(edges, supposition) for supposition in tried), key=lambda one: -one.significance)
+    ascended = [_local_ascent(edges, one.supposition, one.starts) for one in screened[:ASCENDING]]
     best = sorted(ascended, key=lambda one: -one.significance)[:SETTLED]
-    variants = Counter(one.supposition.code for one in screened)
+    variants = Counter((one.code, one.also) for one in tried)
     ends = [_settled(edges, one) for one in best]
-    least = LEAST_IN_VIEW * max(one.in_view for one in (of_given, *ends))
-    return [of_given, *_with_priors([one for one in ends if one.in_view >= least], variants)]
+    least = LEAST_IN_VIEW * max(one.in_view for one in (given, *ends))
+    return _with_priors([one for one in ends if one.in_view >= least], variants)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -415,8 +502,9 @@ def _settled(edges: Edges, ascended: Ranked, null: tuple[float, float] | None = 
         z = np.array([around.at(int(pose)).significance for pose in looking])
         null = float(z.mean()), max(1.0, float(z.std()))
     significance = (at.significance - null[0]) / null[1]
-    log_likelihood = 0.5 * max(significance, 0.0) ** 2
-    return Ranked(ascended.supposition, end, significance, in_view, null, log_likelihood + log(AS_GIVEN_ODDS))
+    log_posterior = 0.5 * max(significance, 0.0) ** 2 + log(AS_GIVEN_ODDS)
+    log_posterior += _log_prior_of_centre(ascended.supposition.camera)
+    return Ranked(ascended.supposition, end, significance, in_view, null, log_posterior)
 
 
 def _ascended(frames: EdgeFrames, poses: Sequence[Matrix4], step_rad: float) -> list[Matrix4]:
@@ -424,7 +512,7 @@ def _ascended(frames: EdgeFrames, poses: Sequence[Matrix4], step_rad: float) -> 
     return [summit.pose for summit in ascend(frames, ascents, _moves(step_rad))]
 
 
-def _with_priors(ranked: Sequence[Ranked], variants: Mapping[str, int]) -> list[Ranked]:
+def _with_priors(ranked: Sequence[Ranked], variants: Mapping[tuple[str, str], int]) -> list[Ranked]:
     """Suppositions that put the camera to one place fit equally well. Which is the likeliest depends on how far each is
     from there, and on the odds of its kind, of which there are so many `variants`."""
     probable = []
@@ -435,10 +523,16 @@ def _with_priors(ranked: Sequence[Ranked], variants: Mapping[str, int]) -> list[
         best = max(alike, key=lambda other: other.significance)
         difference = se3.difference(best.T_camera_lidar, one.supposition.T_camera_lidar)
         away = (difference[:3] @ difference[:3]) / KNOWN_TO_RAD**2 + (difference[3:] @ difference[3:]) / KNOWN_TO_M**2
-        odds = KINDS[one.supposition.code].odds / variants[one.supposition.code]
-        log_posterior = 0.5 * max(best.significance, 0.0) ** 2 + log(odds) - 2.0 * log1p(away)
+        code, also = one.supposition.code, one.supposition.also
+        odds = KINDS[code].odds * (KINDS[also].odds if also else 1.0) / variants[code, also]
+        log_prior = log(odds) - 2.0 * log1p(away) + _log_prior_of_centre(one.supposition.camera)
+        log_posterior = 0.5 * max(best.significance, 0.0) ** 2 + log_prior
         probable.append(replace(one, significance=best.significance, log_posterior=log_posterior))
     return sorted(probable, key=lambda one: -one.log_posterior)
+
+
+def _log_prior_of_centre(camera: Camera) -> float:
+    return -log(CENTRED_ODDS) if off_middle(camera) > OFF_MIDDLE else 0.0
 
 
 def _same_place(one: Ranked, other: Ranked) -> bool:

@@ -41,6 +41,7 @@ FOCAL_LENGTHS_SWAPPED, CENTRE_SWAPPED, RECTIFIED = "focal_lengths_swapped", "cen
 COMPENSATED, CLOCK_OFFSET = "already_compensated", "clock_offset"
 BACKWARDS, MOTION_AXES = "motion_backwards", "motion_axes"
 TURNED_180, TURNED_90, MIRRORED = "image_turned_180", "image_turned_90", "image_mirrored"
+IMAGE_SIZE, OFF_BY_ONE = "image_size", "off_by_one"
 
 KINDS: Mapping[str, Kind] = MappingProxyType(
     {
@@ -102,7 +103,7 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
         ),
         PRINCIPAL_POINT: Kind(
             0.1,
-            "the principal point in the middle of the image",
+            "another principal point",
             "cx and cy are probably those of another image: adapt them to the crop",
         ),
         FOCAL_LENGTHS_SWAPPED: Kind(0.05, "fx and fy exchanged", "fx and fy are probably exchanged"),
@@ -146,6 +147,12 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
             "the stamps of camera and LiDAR are probably off: a frame late, or sweeps stamped at their end and not at "
             "their beginning, or the reverse",
         ),
+        OFF_BY_ONE: Kind(
+            0.1,
+            "each image paired with the sweep before or after its own",
+            "the images are probably listed, or stamped, a frame before or after their clouds: correct the list, or "
+            "the stamps",
+        ),
         MIRRORED: Kind(
             0.05,
             "the images mirrored",
@@ -179,6 +186,10 @@ NOTICEABLE = 0.03
 DISTORTED = ("radtan", "rational", "kannala_brandt")
 """Models whose images are commonly rectified."""
 
+RECTIFIED_ZOOMS = (1.0, 0.85, 0.72, 0.61, 0.52)
+"""Ratios of the focal length of a rectified image to that of the raw one, which may be less, to hold more of the
+view."""
+
 LEAST_SCALE, OFF_MIDDLE = 0.1, 0.15
 """Least relative difference of the two sizes, and how far a principal point lies off the middle at most, as a share of
 the image."""
@@ -186,8 +197,12 @@ the image."""
 LONG_TRANSLATION_M = 3.0
 """From this length on a translation may be in centimetres or millimetres."""
 
-NEAR_MIDDLE = 0.1
-"""Relative distance from the middle within which a principal point has to lie if cx and cy are exchanged."""
+CROPS = (-0.24, -0.18, -0.12, -0.06, 0.06, 0.12, 0.18, 0.24)
+"""Shifts of the principal point along one side that are tried, as a share of it: those of images whose crop is missing
+in cx and cy."""
+
+FARTHEST_OFF_MIDDLE = 0.3
+"""How far a crop at one side leaves a principal point off the middle, as a share of that side."""
 
 UNEQUAL_FOCAL_LENGTHS = 0.1
 """Relative difference of fx and fy from which on their order matters."""
@@ -201,23 +216,37 @@ class Supposition:
         code: of the mistake, see `KINDS`; `AS_GIVEN` without one.
         camera, T_camera_lidar: intrinsics and extrinsic (4, 4).
         mirrored: whether the images have to be mirrored left-right.
+        also: code of a second mistake; empty without one.
     """
 
     code: str
     camera: Camera
     T_camera_lidar: Matrix4
     mirrored: bool = False
+    also: str = ""
 
 
 def suppositions(rig: Rig) -> list[Supposition]:
-    """The inputs as given, first, and as they would be without each mistake."""
+    """The inputs as they would be without each mistake."""
     given = Supposition(AS_GIVEN, rig.camera, rig.T_camera_lidar_nominal)
     poses = [replace(given, code=code, T_camera_lidar=T) for code, T in _poses(rig.T_camera_lidar_nominal)]
     if rig.cloud is not None:
         for T_cloud_lidar in (rig.cloud.T_cloud_lidar, se3.inverse(rig.cloud.T_cloud_lidar)):
             poses.append(replace(given, code=CLOUD_FRAME, T_camera_lidar=given.T_camera_lidar @ T_cloud_lidar))
     lenses = (replace(given, code=code, camera=camera) for code, camera in _lenses(rig.camera))
-    return [given, *poses, *_of_images(given), *lenses]
+    return [*poses, *_of_images(given), *lenses]
+
+
+def suppositions_of_two(rig: Rig) -> list[Supposition]:
+    """The inputs as they would be without two mistakes: one of the common ones in the pose, and one in the images or in
+    their size."""
+    pairs = []
+    for code, T in _poses(rig.T_camera_lidar_nominal):
+        if code in (INVERSE_POSE, QUATERNION_ORDER, CAMERA_AXES, INVERSE_AND_AXES):
+            first = Supposition(code, rig.camera, T)
+            scales = (replace(first, code=IMAGE_SCALE, camera=camera) for camera in _scaled(rig.camera))
+            pairs += [replace(both, code=code, also=both.code) for both in (*_of_images(first), *scales)]
+    return pairs
 
 
 QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -265,12 +294,32 @@ def _of_images(given: Supposition) -> Iterator[Supposition]:
     right, bottom = camera.width - 1.0 - camera.cx, camera.height - 1.0 - camera.cy
     upside_down = changed(camera, cx=right, cy=bottom)
     yield replace(given, code=TURNED_180, camera=upside_down, T_camera_lidar=_about(2, 2) @ T)
+    turned = changed(camera, fx=camera.fy, fy=camera.fx, cx=camera.cy, cy=camera.cx)
     for quarters in (1, 3):
-        turned = changed(camera, fx=camera.fy, fy=camera.fx, cx=camera.cy, cy=camera.cx)
-        yield replace(given, code=TURNED_90, camera=turned, T_camera_lidar=_about(2, quarters) @ T)
+        # The intrinsics are those of the images after they were turned, or before.
+        for lens in (camera, turned) if off_middle(turned) <= OFF_MIDDLE else (camera,):
+            yield replace(given, code=TURNED_90, camera=lens, T_camera_lidar=_about(2, quarters) @ T)
     yield replace(given, code=MIRRORED, mirrored=True)
     # Mirrored top-bottom: mirrored left-right and turned by 180°.
     yield replace(given, code=MIRRORED, camera=upside_down, T_camera_lidar=_about(2, 2) @ T, mirrored=True)
+
+
+def off_middle(camera: Camera) -> float:
+    """How far the principal point is off the middle of the image, as a share of the image."""
+    right, down = camera.cx - 0.5 * (camera.width - 1.0), camera.cy - 0.5 * (camera.height - 1.0)
+    return max(abs(right) / camera.width, abs(down) / camera.height)
+
+
+def _scaled(camera: Camera) -> Iterator[Camera]:
+    """The intrinsics for other sizes of the image, with which the principal point is about in the middle."""
+    # Its place shows the size of the image that the intrinsics belong to.
+    of_centre = camera.width / (2.0 * camera.cx + 1.0) if camera.cx > 0.0 else 1.0
+    usual = min(SCALES, key=lambda scale: abs(scale / of_centre - 1.0))
+    for scale in (*SCALES, *([] if abs(usual / of_centre - 1.0) < LEAST_SCALE else [of_centre])):
+        right, down = scale * (camera.cx + 0.5) - 0.5, scale * (camera.cy + 0.5) - 0.5
+        other = changed(camera, fx=scale * camera.fx, fy=scale * camera.fy, cx=right, cy=down)
+        if abs(scale - 1.0) > LEAST_SCALE and off_middle(other) <= OFF_MIDDLE:
+            yield other
 
 
 def _lenses(camera: Camera) -> Iterator[tuple[str, Camera]]:
@@ -278,27 +327,28 @@ def _lenses(camera: Camera) -> Iterator[tuple[str, Camera]]:
     middle = (0.5 * (camera.width - 1.0), 0.5 * (camera.height - 1.0))
     for zoom in ZOOMS:
         yield FOCAL_LENGTH, changed(camera, fx=zoom * fx, fy=zoom * fy)
-    # A principal point is about in the middle: its place shows the size of the image that the intrinsics belong to.
-    of_centre = camera.width / (2.0 * cx + 1.0) if cx > 0.0 else 1.0
-    usual = min(SCALES, key=lambda scale: abs(scale / of_centre - 1.0))
-    for scale in (*SCALES, *([] if abs(usual / of_centre - 1.0) < LEAST_SCALE else [of_centre])):
-        right, down = scale * (cx + 0.5) - 0.5, scale * (cy + 0.5) - 0.5
-        off = max(abs(right - middle[0]) / camera.width, abs(down - middle[1]) / camera.height)
-        if abs(scale - 1.0) > LEAST_SCALE and off <= OFF_MIDDLE:
-            yield IMAGE_SCALE, changed(camera, fx=scale * fx, fy=scale * fy, cx=right, cy=down)
-    if max(abs(cx - middle[0]) / camera.width, abs(cy - middle[1]) / camera.height) > NOTICEABLE:
+    for other in _scaled(camera):
+        yield IMAGE_SCALE, other
+    if off_middle(camera) > NOTICEABLE:
         yield PRINCIPAL_POINT, changed(camera, cx=middle[0], cy=middle[1])
-    if max(abs(cy / middle[0] - 1.0), abs(cx / middle[1] - 1.0)) < NEAR_MIDDLE < abs(cx / middle[0] - 1.0):
-        yield CENTRE_SWAPPED, changed(camera, cx=cy, cy=cx)
+    for share in CROPS:
+        right, down = cx + share * camera.width, cy + share * camera.height
+        if abs(right - middle[0]) <= FARTHEST_OFF_MIDDLE * camera.width:
+            yield PRINCIPAL_POINT, changed(camera, cx=right)
+        if abs(down - middle[1]) <= FARTHEST_OFF_MIDDLE * camera.height:
+            yield PRINCIPAL_POINT, changed(camera, cy=down)
+    swapped = changed(camera, cx=cy, cy=cx)
+    if NOTICEABLE < off_middle(camera) > 2.0 * off_middle(swapped):
+        yield CENTRE_SWAPPED, swapped
     if abs(fx / fy - 1.0) >= UNEQUAL_FOCAL_LENGTHS:
         yield FOCAL_LENGTHS_SWAPPED, changed(camera, fx=fy, fy=fx)
-    if cameras.name_of(camera) in DISTORTED:
-        size = {"width": camera.width, "height": camera.height}
-        pinhole = cameras.build("pinhole", **size, fx=fx, fy=fy, cx=cx, cy=cy)
-        ray = (0.4 * camera.width / fx, 0.0, 1.0)
-        displaced_px = cameras.project_point(camera, *ray)[0] - cameras.project_point(pinhole, *ray)[0]
-        if abs(displaced_px) > NOTICEABLE * camera.width:
-            yield RECTIFIED, pinhole
+    size = {"width": camera.width, "height": camera.height}
+    pinhole = cameras.build("pinhole", **size, fx=fx, fy=fy, cx=cx, cy=cy)
+    ray = (0.4 * camera.width / fx, 0.0, 1.0)
+    displaced_px = cameras.project_point(camera, *ray)[0] - cameras.project_point(pinhole, *ray)[0]
+    if cameras.name_of(camera) in DISTORTED and abs(displaced_px) > NOTICEABLE * camera.width:
+        for zoom in RECTIFIED_ZOOMS:
+            yield RECTIFIED, changed(pinhole, fx=zoom * fx, fy=zoom * fy)
 
 
 def changed(camera: Camera, **intrinsics: float) -> Camera:

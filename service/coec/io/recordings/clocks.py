@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 
 import numpy as np
+from numpy.typing import NDArray
 
 
 def clocks_text(camera_stamps_ns: Sequence[int], sweep_stamps_ns: Sequence[int]) -> str:
@@ -15,7 +16,20 @@ def clocks_text(camera_stamps_ns: Sequence[int], sweep_stamps_ns: Sequence[int])
     overlap = sweeps[0] <= cameras[-1] and cameras[0] <= sweeps[-1]
     if not overlap:
         offset_s = float(sweeps[0] - cameras[0])
-    return _offset_text(offset_s, float(cameras[0]), float(sweeps[0]))
+    return _offset_text(_known_gap_s(cameras, sweeps) or offset_s, float(cameras[0]), float(sweeps[0]))
+
+
+def _known_gap_s(cameras: NDArray[np.float64], sweeps: NDArray[np.float64]) -> float | None:
+    """The known difference of clocks with which nearly every image of a selection, whose intervals are long, has a
+    sweep; None if none does, or several do."""
+    known_s = (*TIME_SCALES_S, *(3600.0 * hours for hours in range(1, MOST_HOURS)))
+    compared = cameras[:: max(1, len(cameras) // COMPARED)]
+    fitting = [
+        gap_s
+        for gap_s in (sign * known for known in known_s for sign in (-1.0, 1.0))
+        if np.mean([np.abs(sweeps - stamp_s - gap_s).min() < PARTNER_S for stamp_s in compared]) >= FITTING
+    ]
+    return fitting[0] if len(fitting) == 1 and len(cameras) >= FEWEST_STAMPS else None
 
 
 def clock_separation_text(camera_stamps_ns: Sequence[int], sweep_stamps_ns: Sequence[int]) -> str:
@@ -96,6 +110,10 @@ TIME_SCALES_S = {
 
 MOST_HOURS = 26
 """Time zones are up to so far apart."""
+
+PARTNER_S, FITTING, COMPARED = 0.1, 0.9, 40
+"""An image has a sweep within this time, s, by a difference of clocks that this share of them shows, of about so many
+images."""
 
 LATE_S = 0.5
 """Messages arrive within this time."""
