@@ -137,7 +137,7 @@ COMMON: Mapping[str, tuple[str, ...]] = {
     "edges.range_edges": ("_jumps",),
     "edges.reflectance_edges": ("_steps",),
     "edges.scan_lines": ("_along_the_rows",),
-    "images": ("_first_of", "_unite", "connected_groups", "level_counts", "neighbour_differences", "square_sums"),
+    "images": ("connected_groups", "level_counts", "neighbour_differences", "square_sums"),
     "mutual_information": ("_count_reached", "_information", "_informations", "_tasks"),
     "sweep_kernels": ("_bearings", "_deskew", "grid_counts"),
 }  # fmt: skip

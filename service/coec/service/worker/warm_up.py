@@ -30,6 +30,7 @@ from coec.geometry.cameras import Camera, scaled
 from coec.geometry.edges import alignment
 from coec.geometry.edges.charts import charted_significances, edge_charts, pattern_search, select_separated
 from coec.geometry.edges.displaced_alignment import DisplacedEdges, linearised
+from coec.geometry.images import connected_groups
 from coec.geometry.mutual_information import BinnedFrames, information_of_each, mutual_information, share_of_pixels
 from coec.geometry.projection import project
 from coec.io.images import GreyImages, encode_jpeg
@@ -66,6 +67,7 @@ def late_kernels(camera: Camera) -> tuple[Callable[[], object], ...]:
         lambda: information_of_each(binned, two),
         lambda: mutual_information(binned, pose),
         lambda: share_of_pixels(values, values > 0.0, np.ones(1, np.float32)),
+        lambda: connected_groups(values > 0.0),
         lambda: alignment.significances(edges, two),
         lambda: sample_reach(pose, SearchBox(0.1, 0.0), 8),
         lambda: select_separated(two, np.arange(2), 1, 3.0),
