@@ -80,7 +80,7 @@ coarse edges."""
 STARTS, ABOUT_RAD, COVER_ABOUT = 9, radians(0.8), 40
 """Best poses of a cover, about each of which turns are scored on finer edges, their reach and their number."""
 
-ASCENTS, ASCENDING, SETTLED = 3, 24, 8
+ASCENTS, ASCENDING, SETTLED = 7, 24, 8
 """Local ascents of a supposition; suppositions that have any; and those that reach the finest edges."""
 
 NULL_POSES, NULL_RAD, NULL_INSIDE = 150, radians(15.0), 0.3

@@ -245,7 +245,9 @@ def suppositions_of_two(rig: Rig) -> list[Supposition]:
         if code in (INVERSE_POSE, QUATERNION_ORDER, CAMERA_AXES, INVERSE_AND_AXES):
             first = Supposition(code, rig.camera, T)
             scales = (replace(first, code=IMAGE_SCALE, camera=camera) for camera in _scaled(rig.camera))
-            pairs += [replace(both, code=code, also=both.code) for both in (*_of_images(first), *scales)]
+            # What is turned by 90° as well is rare, and fits by chance.
+            seconds = (*(one for one in _of_images(first) if one.code != TURNED_90), *scales)
+            pairs += [replace(both, code=code, also=both.code) for both in seconds]
     return pairs
 
 
