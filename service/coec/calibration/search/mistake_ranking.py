@@ -217,11 +217,12 @@ def probable_mistake(data: WindowData, solved: Matrix4 | None) -> Mistake | None
     shifted = _other_pairing(data)
     if shifted is not None and shifted.log_posterior > max(best.log_posterior, given.log_posterior) + log(LEAST_ODDS):
         return _named(shifted, given)
-    if timed is not None and timed.log_posterior > best.log_posterior:
+    certain = _is_certain(ranked, given)
+    if timed is not None and (timed.log_posterior > best.log_posterior or not certain):
         mistake = _named(timed, given)
         by = f"(the clouds {late_s:+.3f} s; of a bag, ?lidar_offset={late_s:.3f})"
         return replace(mistake, text=f"{mistake.text} {by}") if late_s else mistake
-    if not _is_certain(ranked, given):
+    if not certain:
         ranked = sorted(
             [*ranked, *_ranked(edges, suppositions_of_two(data.window.rig), given)], key=lambda one: -one.log_posterior
         )
@@ -229,12 +230,15 @@ def probable_mistake(data: WindowData, solved: Matrix4 | None) -> Mistake | None
 
 
 def _is_certain(ranked: Sequence[Ranked], given: Ranked) -> bool:
-    """Whether the first, the most probable, is `LEAST_ODDS` more probable than all that put the camera elsewhere."""
+    """Whether the first, the most probable, is `LEAST_ODDS` more probable than all other mistakes that put the camera
+    elsewhere."""
     share = GROSS_OF_TWO if ranked and ranked[0].supposition.also else GROSS
     if not ranked or given.significance > share * ranked[0].significance:
         return False
-    rivals = [given.log_posterior, *(one.log_posterior for one in ranked[1:] if not _same_place(one, ranked[0]))]
-    return ranked[0].log_posterior - float(np.logaddexp.reduce(rivals)) >= log(LEAST_ODDS)
+    first, others = ranked[0].supposition, ranked[1:]
+    rivals = [one for one in others if one.supposition.code != first.code and not _same_place(one, ranked[0])]
+    log_rivals = [given.log_posterior, *(one.log_posterior for one in rivals)]
+    return ranked[0].log_posterior - float(np.logaddexp.reduce(log_rivals)) >= log(LEAST_ODDS)
 
 
 def _named(best: Ranked, given: Ranked) -> Mistake:
@@ -337,7 +341,8 @@ def _other_time(data: WindowData, edges: Edges, given: Ranked) -> tuple[float, R
         rivals.append(replace(rival, log_posterior=rival.log_posterior + odds))
     best = max(ends[1:], key=lambda end: end[1].log_posterior)
     if best[1].supposition.code == MOTION_AXES:
-        rivals += [end for _, end in ends[1:] if end.supposition.code != MOTION_AXES]
+        # Motion backwards is motion in other axes, too, of a vehicle that hardly turns.
+        rivals += [end for _, end in ends[1:] if end.supposition.code not in (MOTION_AXES, BACKWARDS)]
     least = max(rival.log_posterior for rival in rivals) + log(LEAST_ODDS)
     return best if best[1].log_posterior >= least else (0.0, None)
 
