@@ -30,41 +30,45 @@ AROUND_S = 1.0
 """Sensor time before and after the moment that is explained."""
 
 
+Depth = Annotated[
+    str | None,
+    typer.Option(
+        help="Depth network: of a window, if it has moved since; of a drive, in place of the configured one.",
+        metavar="MODEL",
+    ),
+]
+ConfigFile = Annotated[
+    Path | None, typer.Option(help="Configuration of the service whose drive it is; else defaults.", metavar="FILE")
+]
+Pair = Annotated[str | None, typer.Option(help="Only this pair of the configuration; else all of them, as one rig.")]
+Log = Annotated[Path | None, typer.Option(help="Write the decisions of the drive here (JSON lines).")]
+Against = Annotated[
+    Path | None,
+    typer.Option(
+        help="Compare the decisions with this log, or the state directory of a service; exit 1 if they differ.",
+        metavar="LOG|DIR",
+    ),
+]
+Begin = Annotated[float, typer.Option("--from", help="Begin so many seconds into the drive.", min=0.0)]
+Until = Annotated[float | None, typer.Option("--until", help="End so many seconds into the drive.", min=0.0)]
+Explain = Annotated[
+    float | None,
+    typer.Option("--explain", help="Show which events led to which actions so many seconds into the drive.", min=0.0),
+]
+Report = Annotated[Path | None, typer.Option(help="Write a page with the decisions and differences here.")]
+
+
 def replay(
     source: Source,
-    depth: Annotated[
-        str | None,
-        typer.Option(
-            help="Depth network: of a window, if it has moved since; of a drive, in place of the configured one.",
-            metavar="MODEL",
-        ),
-    ] = None,
-    config: Annotated[
-        Path | None,
-        typer.Option(help="Configuration of the service whose drive it is; else defaults.", metavar="FILE"),
-    ] = None,
-    pair: Annotated[
-        str | None, typer.Option(help="Only this pair of the configuration; else all of them, as one rig.")
-    ] = None,
-    log: Annotated[Path | None, typer.Option(help="Write the decisions of the drive here (JSON lines).")] = None,
-    against: Annotated[
-        Path | None,
-        typer.Option(
-            help="Compare the decisions with this log, or the state directory of a service; exit 1 if they differ.",
-            metavar="LOG|DIR",
-        ),
-    ] = None,
-    begin_s: Annotated[float, typer.Option("--from", help="Begin so many seconds into the drive.", min=0.0)] = 0.0,
-    until_s: Annotated[
-        float | None, typer.Option("--until", help="End so many seconds into the drive.", min=0.0)
-    ] = None,
-    explain_s: Annotated[
-        float | None,
-        typer.Option(
-            "--explain", help="Show which events led to which actions so many seconds into the drive.", min=0.0
-        ),
-    ] = None,
-    report: Annotated[Path | None, typer.Option(help="Write a page with the decisions and differences here.")] = None,
+    depth: Depth = None,
+    config: ConfigFile = None,
+    pair: Pair = None,
+    log: Log = None,
+    against: Against = None,
+    begin_s: Begin = 0.0,
+    until_s: Until = None,
+    explain_s: Explain = None,
+    report: Report = None,
     as_json: Json = False,
 ) -> int:
     """Reproduce the recorded decision of a window, or replay a whole drive through the engine of the service.
@@ -94,14 +98,13 @@ def replay(
     recordings, configuration = _opened(source, config, pair, depth)
     drives, rig = _replay_drive(recordings, configuration, begin_s, until_s)
     first_ns = min(recording.camera_stamps_ns[0] for recording in recordings.values())
-    differing = None if against is None else {name: _compared(against, name, drive) for name, drive in drives.items()}
+    differing = {} if against is None else {name: _compared(against, name, drive) for name, drive in drives.items()}
     if log is not None:
         write_log(log, {name: drive.decisions for name, drive in drives.items()})
     if report is not None:
-        write_replay_page(report, source, drives, first_ns, differing)
+        write_replay_page(report, source, drives, first_ns, differing or None)
     if as_json:
-        compared: Mapping[str, tuple[Difference, ...] | None] = differing or dict.fromkeys(drives)
-        documents = {name: _document(drive, compared[name]) for name, drive in drives.items()}
+        documents = {name: _document(drive, differing.get(name)) for name, drive in drives.items()}
         whole = {"pairs": documents, "rig": rig.model_dump(mode="json")}
         console.print_json(whole if len(documents) > 1 else documents[next(iter(documents))])
     elif explain_s is not None:
@@ -110,9 +113,9 @@ def replay(
         _table(drives, first_ns)
         if len(drives) > 1:
             _show_rig(rig)
-    if against is not None and differing is not None and not as_json:
+    if against is not None and not as_json:
         _show_differences(differing, against, first_ns)
-    return 1 if differing is not None and any(differing.values()) else 0
+    return 1 if any(differing.values()) else 0
 
 
 # --- a window -------------------------------------------------------------------------------------------------------

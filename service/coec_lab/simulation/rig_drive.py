@@ -29,7 +29,7 @@ from coec.geometry.se3 import inverse, perturb, rotation_exp
 from coec.io.recordings.recording_source import CLOUD, IMAGE, KINDS, MOTION
 from coec_lab.simulation import simulated_sensors
 from coec_lab.simulation.drive import Arrival, arrivals, camera_of, check_rates, lidar_of, needed, seconds_of, stamps_of
-from coec_lab.simulation.faults import Fault, SensorFault, shifted
+from coec_lab.simulation.faults import SensorFault, shifted
 from coec_lab.simulation.journey import Journey
 from coec_lab.simulation.lidar_model import LIDARS, LidarModel, Turn, even_deg
 from coec_lab.simulation.reflectance import INTENSITIES
@@ -301,8 +301,7 @@ class RigDrive:
         return simulated_sensors.Wire(name, hz, number, (number,), self._faults[name])
 
     def _mount(self, name: str) -> simulated_sensors.Mount:
-        faults: tuple[Fault, ...] = self._faults[name]
-        return lambda time_s: inverse(shifted(self._mounted[name], faults, time_s))
+        return lambda time_s: inverse(shifted(self._mounted[name], self._faults[name], time_s))
 
 
 class SimulatedRigPair:
@@ -318,10 +317,10 @@ class SimulatedRigPair:
     def __init__(self, drive: RigDrive, camera: str, lidar: str) -> None:
         self._drive = drive
         self._camera, self._lidar = camera, lidar
+        self._streams = {IMAGE: drive.stream(camera), CLOUD: drive.stream(lidar), MOTION: drive.stream(EGO)}
         T_lidar_ego = drive.T_sensor_ego_nominal(lidar)
         nominal = simulated_sensors.product(drive.T_sensor_ego_nominal(camera), inverse(T_lidar_ego))
-        pair = f"{camera}-{lidar}"
-        self.rig = Rig(pair, drive.camera, camera, lidar, nominal, T_lidar_ego, mask=drive.mask(camera))
+        self.rig = Rig(f"{camera}-{lidar}", drive.camera, camera, lidar, nominal, T_lidar_ego, mask=drive.mask(camera))
 
     @property
     def name(self) -> str:
@@ -336,17 +335,17 @@ class SimulatedRigPair:
     @property
     def camera_stamps_ns(self) -> tuple[int, ...]:
         """Stamps of the camera frames that arrive, ascending."""
-        return stamps_of(self._plan, self._drive.stream(self._camera))
+        return stamps_of(self._plan, self._streams[IMAGE])
 
     @property
     def sweep_stamps_ns(self) -> tuple[int, ...]:
         """Stamps of the sweeps that arrive, ascending."""
-        return stamps_of(self._plan, self._drive.stream(self._lidar))
+        return stamps_of(self._plan, self._streams[CLOUD])
 
     @property
     def motion_stamps_ns(self) -> tuple[int, ...]:
         """Stamps of the ego-motion that arrives, ascending."""
-        return stamps_of(self._plan, self._drive.stream(EGO))
+        return stamps_of(self._plan, self._streams[MOTION])
 
     def truth(self, stamp_ns: int) -> Matrix4:
         """True T_camera_lidar (4, 4) at a time."""
@@ -355,21 +354,18 @@ class SimulatedRigPair:
 
     def messages(self, cameras: Collection[int] | None = None, kinds: Collection[str] = KINDS) -> Iterator[Frame]:
         """See `Recording.messages`."""
-        streams = [self._drive.stream(name) for name in (self._camera, self._lidar, EGO)]
-        required = self._plan if cameras is None else needed(self._plan, cameras, *streams)
-        loaded = {stream for stream, kind in zip(streams, (IMAGE, CLOUD, MOTION), strict=True) if kind in kinds}
+        required = self._plan if cameras is None else needed(self._plan, cameras, *self._streams.values())
+        loaded = {self._streams[kind] for kind in kinds}
         return (self._drive.message(entry) for entry in required if entry.stream in loaded)
 
     def sweeps(self, stamps_ns: Collection[int]) -> Iterator[LidarFrame]:
         """See `Recording.sweeps`."""
-        lidar = self._drive.stream(self._lidar)
-        required = (entry for entry in self._plan if entry.stream == lidar and entry.stamp_ns in stamps_ns)
-        return (frame for frame in map(self._drive.message, required) if isinstance(frame, LidarFrame))
+        sweeps = (one for one in self._plan if one.stream == self._streams[CLOUD] and one.stamp_ns in stamps_ns)
+        return (frame for frame in map(self._drive.message, sweeps) if isinstance(frame, LidarFrame))
 
     @cached_property
     def _plan(self) -> list[Arrival]:
-        ours = {self._drive.stream(name) for name in (self._camera, self._lidar, EGO)}
-        return [entry for entry in self._drive.plan if entry.stream in ours]
+        return [entry for entry in self._drive.plan if entry.stream in self._streams.values()]
 
 
 MOTION_NS = 250_000_000
