@@ -20,7 +20,7 @@ from coec.calibration import pipeline
 from coec.calibration import types as calibration
 from coec.calibration.frames.time_offset import TimeOffset, estimate_time_offset
 from coec.calibration.search.mistake_ranking import probable_mistake
-from coec.calibration.search.mistakes import BACKWARDS, CLOCK_OFFSET, COMPENSATED, MOTION_AXES
+from coec.calibration.search.mistakes import BACKWARDS, CLOCK_OFFSET, COMPENSATED, MOTION_AXES, MOTION_UNIT
 from coec.calibration.search.without_start import Weighed, calibrate_without_start, without_start
 from coec.calibration.solver import prepare_window_data
 from coec.calibration.uncertainty.systematic import require_fit
@@ -213,7 +213,7 @@ def calibrated(
     return estimate, mistake
 
 
-OF_TIMING = (CLOCK_OFFSET, COMPENSATED, BACKWARDS, MOTION_AXES)
+OF_TIMING = (CLOCK_OFFSET, COMPENSATED, BACKWARDS, MOTION_AXES, MOTION_UNIT)
 """Mistakes that irregular stamps or wrong velocities look like."""
 
 OF_RECORDING: Mapping[str, tuple[str, tuple[str, ...]]] = MappingProxyType(

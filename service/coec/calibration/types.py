@@ -165,12 +165,13 @@ class EgoMotion:
         x, y, z = self.angular_radps
         return float(np.sqrt(x * x + y * y + z * z))
 
-    def in_axes(self, rotation: NDArray[np.float64]) -> EgoMotion:
-        """The motion whose vectors are those of this one, multiplied by a matrix (3, 3): -1 for the opposite motion."""
-        x, y, z = (rotation @ np.array(self.angular_radps)).tolist()
+    def in_axes(self, rotation: NDArray[np.float64], linear: float = 1.0, angular: float = 1.0) -> EgoMotion:
+        """The motion whose vectors are those of this one, multiplied by a matrix (3, 3): -1 for the opposite motion;
+        and by a factor each."""
+        x, y, z = (angular * rotation @ np.array(self.angular_radps)).tolist()
         if self.linear_mps is None:
             return replace(self, angular_radps=(x, y, z))
-        along_x, along_y, along_z = (rotation @ np.array(self.linear_mps)).tolist()
+        along_x, along_y, along_z = (linear * rotation @ np.array(self.linear_mps)).tolist()
         return replace(self, linear_mps=(along_x, along_y, along_z), angular_radps=(x, y, z))
 
     def reaches(self, speed_mps: float) -> bool:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -162,6 +163,28 @@ def test_a_pose_of_a_camera_that_is_not_turned_is_named(few: Window) -> None:
     assert (mistake.code, mistake.camera) == (mistakes.TURNED_90, upright)
 
 
+def test_raw_images_with_intrinsics_that_have_no_distortion_are_named(few: Window) -> None:
+    right = approximate(few.rig)
+    camera = right.camera
+    matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    pixels = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
+    straight = cv2.undistortPoints(pixels[:, None], matrix, np.array([-0.3, 0.1, 0.0, 0.0]), P=matrix)
+    across, down = straight.astype(np.float32).reshape(camera.height, camera.width, 2).transpose(2, 0, 1)
+    mistake = named(
+        given(few, right), lambda grey: np.asarray(cv2.remap(grey, across, down, cv2.INTER_LINEAR), np.uint8)
+    )
+    assert mistake is not None
+    assert (mistake.code, mistake.correctable) == (mistakes.DISTORTION, False)
+
+
+def test_an_inverse_pose_with_another_focal_length_is_named(few: Window) -> None:
+    wrong = wrong_pose(mistakes.INVERSE_POSE, wrong_lens(mistakes.FOCAL_LENGTH, approximate(few.rig)))
+    mistake = named(given(few, wrong))
+    assert mistake is not None
+    assert mistake.code == mistakes.INVERSE_POSE
+
+
 def test_two_mistakes_at_once_are_named(few: Window) -> None:
     right = approximate(few.rig)
     mistake = named(given(few, wrong_pose(mistakes.INVERSE_POSE, right)), lambda grey: grey[::-1, ::-1])
@@ -263,6 +286,16 @@ def test_motion_in_other_axes_is_named(street: Window) -> None:
     mistake = named(replace(street, pairs=sideways))
     assert mistake is not None
     assert (mistake.code, mistake.correctable) == (mistakes.MOTION_AXES, False)
+
+
+def test_velocities_in_kilometres_per_hour_are_named(street: Window) -> None:
+    fast = tuple(
+        replace(pair, motion=None if pair.motion is None else pair.motion.in_axes(np.eye(3), linear=3.6))
+        for pair in street.pairs
+    )
+    mistake = named(replace(street, pairs=fast))
+    assert mistake is not None
+    assert (mistake.code, mistake.correctable) == (mistakes.MOTION_UNIT, False)
 
 
 def test_stamps_with_jitter_accuse_neither_driver_nor_motion(street: Window) -> None:

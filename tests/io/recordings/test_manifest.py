@@ -355,6 +355,12 @@ def test_clouds_in_another_frame_come_back_to_the_lidars(tmp_path: Path) -> None
     a_dataset(tmp_path, frames=frames)
     with pytest.raises(SourceError, match=r"given.npz: The points contradict their origin.*`T_cloud_lidar`"):
         list(open_source(str(tmp_path)).messages())
+    # In a table all columns are floats, and seen from elsewhere the beams have no elevations of their own.
+    table = np.column_stack([sweep_in_frame(turning_sweep(), ROOF_POSE).xyz_m, np.asarray(turning_sweep().ring)])
+    np.save(tmp_path / "given.npy", table.astype(np.float32))
+    a_dataset(tmp_path, frames=[{**frames[0], "cloud": "given.npy"}], cloud_columns=["x", "y", "z", "ring"])
+    with pytest.raises(SourceError, match=r"given.npy: The points contradict their origin.*`T_cloud_lidar`"):
+        list(open_source(str(tmp_path)).messages())
 
 
 def test_compensated_clouds_are_recognised_by_their_turn(tmp_path: Path) -> None:

@@ -251,7 +251,7 @@ def build_edges(pairs: Sequence[FramePair], points: Points, greys: Iterable[NDAr
     Raises:
         CalibrationError: no sweep has an edge, or an image is not of the camera's size.
     """
-    detected = _detected(pairs)
+    detected = detected_edges(pairs)
     first_point = np.concatenate([[0], np.cumsum([len(edges.weight) for edges in detected])]).astype(np.int64)
     if first_point[-1] == 0:
         raise CalibrationError(
@@ -299,7 +299,7 @@ def build_edges(pairs: Sequence[FramePair], points: Points, greys: Iterable[NDAr
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Detected:
+class DetectedEdges:
     """Edges of a sweep, those of range before those of reflectance: as in `SweepEdges`, and the kind of each, uint8."""
 
     index: NDArray[np.int64]
@@ -308,7 +308,7 @@ class _Detected:
     kind: NDArray[np.uint8]
 
 
-def _detected(pairs: Sequence[FramePair]) -> list[_Detected]:
+def detected_edges(pairs: Sequence[FramePair]) -> list[DetectedEdges]:
     """The edges of each sweep; those in one cell share their weight."""
     of_range: list[SweepEdges] = []
     steps: list[ReflectanceSteps | None] = []
@@ -322,7 +322,7 @@ def _detected(pairs: Sequence[FramePair]) -> list[_Detected]:
     for pair, edges, step in zip(pairs, of_range, steps, strict=True):
         kinds = [edges] if step is None or noise is None else [edges, reflectance_edges(step, noise)]
         detected.append(
-            _Detected(
+            DetectedEdges(
                 np.concatenate([one.index for one in kinds]),
                 np.concatenate([one.shift_m for one in kinds]),
                 np.concatenate(

@@ -14,13 +14,13 @@ nothing.
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import ceil, log, log1p, log2, nan, radians
+from math import ceil, log, log1p, log2, nan, pi, radians
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.frames.evidence import are_raw, compensated_for, upright_axes
-from coec.calibration.objective.edges import COARSEST_BLUR_RAD
+from coec.calibration.objective import edges as cue
 from coec.calibration.objective.mutual_information import SearchBox
 from coec.calibration.search.global_search import sample_reach
 from coec.calibration.search.mistakes import (
@@ -29,33 +29,44 @@ from coec.calibration.search.mistakes import (
     BACKWARDS,
     CLOCK_OFFSET,
     COMPENSATED,
+    DISTORTION,
     FOCAL_LENGTH,
     IMAGE_SCALE,
     IMAGE_SIZE,
     KINDS,
     LIDAR_AXES,
     MOTION_AXES,
+    MOTION_UNIT,
+    NOTICEABLE,
     OFF_BY_ONE,
     OFF_MIDDLE,
     OTHER_AXES,
     QUARTER_TURN,
+    RECTIFIED,
     TURNED_90,
     Supposition,
     changed,
     off_middle,
     suppositions,
     suppositions_of_two,
+    zoomed,
 )
 from coec.calibration.solver import WindowData
 from coec.calibration.types import FramePair, Matrix4, Mistake, Rig
 from coec.errors import CalibrationError
 from coec.geometry import se3
 from coec.geometry.cameras import Camera, pixel_rad, scaled
-from coec.geometry.edges.alignment import AscentStart, EdgeFrames, alignments, ascend, frame_alignment, significances
+from coec.geometry.edges.alignment import (
+    LEAST_SQUARE,
+    AscentStart,
+    EdgeFrames,
+    alignment_of_parts,
+    ascend,
+    frame_alignment,
+    significances,
+)
 from coec.geometry.edges.charts import moved_by, unit_ball
-from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, EdgeScales
-from coec.geometry.edges.range_edges import range_edges
-from coec.geometry.edges.scan_lines import SweepEdges, scan_lines
+from coec.geometry.edges.image_edges import BLUR_SIGMA_PX, STRENGTH_STEPS, EdgeScales
 from coec.geometry.points import thinned
 
 FRAMES = 8
@@ -116,6 +127,10 @@ delay of an exposure."""
 NEAR_ZOOMS = (0.95, 0.97, 0.98, 0.99, 1.01, 1.02, 1.03, 1.05)
 """Ratios of the right focal length to the given one that may be taken for wrong motion."""
 
+COARSER_ZOOMS, FINER_ZOOMS = (1.03,), (1.015, 1.007)
+"""Ratios by which focal lengths are refined, in ascents from every start and at their best end: coarse edges fit to
+about a thirtieth, sharp ones to a hundredth."""
+
 SAME_ASPECT = 0.02
 """Relative difference of the aspect ratios of an image and of the same image in another size, at most."""
 
@@ -133,8 +148,17 @@ the subject of the posterior. See docs/measured.md."""
 GROSS_OF_TWO = 0.5
 """The same for two mistakes at once, of which there are many pairs."""
 
+NOT_CORRECTABLE = (BACKWARDS, MOTION_AXES, MOTION_UNIT, COMPENSATED, CLOCK_OFFSET, OFF_BY_ONE, DISTORTION)
+"""What no pose and no lens that were tried correct."""
+
+UNITS = ((1.0 / 3.6, 1.0), (1.0, pi / 180.0))
+"""What velocities in km/h and turns in degrees per second have to be multiplied by: linear, angular."""
+
 SAME_RAD = radians(5.0)
 """Poses nearer than this are one explanation."""
+
+
+Null = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,7 +169,7 @@ class Ranked:
         T_camera_lidar: (4, 4) that pose.
         significance: of the edges there, in units of its scatter.
         in_view: Σ w² of the range edges in view there.
-        null: mean and standard deviation of the significance where nothing fits.
+        null: mean and standard deviation of the z of each kind of edges where nothing fits.
         log_posterior: up to a constant.
     """
 
@@ -153,27 +177,29 @@ class Ranked:
     T_camera_lidar: Matrix4
     significance: float
     in_view: float
-    null: tuple[float, float]
+    null: Null
     log_posterior: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Edges:
-    """Range edges of some pairs, and the edges of their images at the last levels of a pyramid, from fine to coarse.
+    """Edges of some sweeps, and the edges of their images at the last levels of a pyramid, from fine to coarse.
 
     Attributes:
         xyz_m: (3, E) float32.
         weight: (E,) float32.
+        kind: (E,) uint8, of range or of reflectance.
         first_point: (F + 1,) int64.
         maps: by level, halvings of the resolution and (F, h, w) int8.
-        detected: the range edges of each pair.
+        detected: the edges of each sweep.
     """
 
     xyz_m: NDArray[np.float32]
     weight: NDArray[np.float32]
+    kind: NDArray[np.uint8]
     first_point: NDArray[np.int64]
     maps: tuple[tuple[int, NDArray[np.int8]], ...]
-    detected: tuple[SweepEdges, ...]
+    detected: tuple[cue.DetectedEdges, ...]
 
     def seen_by(self, supposition: Supposition, number: int, points: int) -> EdgeFrames:
         """About `points` of them on one level."""
@@ -191,6 +217,7 @@ class Edges:
         return Edges(
             np.ascontiguousarray(self.xyz_m[:, begin:end]),
             self.weight[begin:end],
+            self.kind[begin:end],
             self.first_point[sweeps : sweeps + count + 1] - begin,
             tuple((level, maps[images : images + count]) for level, maps in self.maps),
             self.detected[sweeps : sweeps + count],
@@ -214,10 +241,11 @@ def probable_mistake(data: WindowData, solved: Matrix4 | None) -> Mistake | None
     ranked = _ranked(edges, suppositions(data.window.rig), given)
     late_s, timed = _other_time(data, edges, given)
     best, *_ = ranked or [given]
-    shifted = _other_pairing(data)
+    certain = _is_certain(ranked, given)
+    # Where a mistake is certain, the edges fit, so that images and sweeps belong together.
+    shifted = None if certain else _other_pairing(data)
     if shifted is not None and shifted.log_posterior > max(best.log_posterior, given.log_posterior) + log(LEAST_ODDS):
         return _named(shifted, given)
-    certain = _is_certain(ranked, given)
     if timed is not None and (timed.log_posterior > best.log_posterior or not certain):
         mistake = _named(timed, given)
         by = f"(the clouds {late_s:+.3f} s; of a bag, ?lidar_offset={late_s:.3f})"
@@ -252,8 +280,7 @@ def _named(best: Ranked, given: Ranked) -> Mistake:
         given.significance,
         supposition.camera,
         supposition.T_camera_lidar,
-        correctable=not supposition.mirrored
-        and supposition.code not in (BACKWARDS, MOTION_AXES, COMPENSATED, CLOCK_OFFSET, OFF_BY_ONE),
+        correctable=not supposition.mirrored and supposition.code not in NOT_CORRECTABLE,
     )
 
 
@@ -321,30 +348,40 @@ def _other_time(data: WindowData, edges: Edges, given: Ranked) -> tuple[float, R
     if not are_raw(driven, T_lidar_ego):
         trials.append((COMPENSATED, 0.0, replace(part, compensated=False)))
     trials.append((BACKWARDS, 0.0, _with_motion(part, -np.eye(3))))
+    trials += [(MOTION_UNIT, 0.0, _with_motion(part, np.eye(3), *factors)) for factors in UNITS]
     if compensated_for(driven, T_lidar_ego) is None:
         trials += [(MOTION_AXES, 0.0, _with_motion(part, rotation)) for rotation in OTHER_AXES]
     trials += [(CLOCK_OFFSET, share * sweep_s, _later(part, share * sweep_s)) for share in LATER]
-    ends = []
-    for code, late_s, other in trials:
+
+    def settled(code: str, other: WindowData) -> Ranked:
         moved = replace(edges, xyz_m=_placed(other, edges.detected))
         supposition = replace(given.supposition, code=code)
         starts = [given.T_camera_lidar, supposition.T_camera_lidar]
         # The same scatter for all: only the difference counts.
         end = _settled(moved, _local_ascent(moved, supposition, starts), given.null)
         odds = 0.0 if code == AS_GIVEN else log(KINDS[code].odds / AS_GIVEN_ODDS)
-        ends.append((late_s, replace(end, log_posterior=end.log_posterior + odds)))
+        return replace(end, log_posterior=end.log_posterior + odds)
+
+    ends = [(late_s, settled(code, other)) for code, late_s, other in trials]
     rivals, as_given, camera = [given, ends[0][1]], ends[0][1], given.supposition.camera
+    late_s, best = max(ends[1:], key=lambda end: end[1].log_posterior)
+    if best.log_posterior < max(rival.log_posterior for rival in rivals) + log(LEAST_ODDS):
+        return 0.0, None
     for zoom in NEAR_ZOOMS:
-        supposition = replace(given.supposition, camera=changed(camera, fx=zoom * camera.fx, fy=zoom * camera.fy))
+        supposition = replace(given.supposition, camera=zoomed(camera, zoom))
         rival = _settled(edges, _local_ascent(edges, supposition, [as_given.T_camera_lidar]), given.null)
         odds = log(KINDS[FOCAL_LENGTH].odds / AS_GIVEN_ODDS)
         rivals.append(replace(rival, log_posterior=rival.log_posterior + odds))
-    best = max(ends[1:], key=lambda end: end[1].log_posterior)
-    if best[1].supposition.code == MOTION_AXES:
-        # Motion backwards is motion in other axes, too, of a vehicle that hardly turns.
-        rivals += [end for _, end in ends[1:] if end.supposition.code not in (MOTION_AXES, BACKWARDS)]
-    least = max(rival.log_posterior for rival in rivals) + log(LEAST_ODDS)
-    return best if best[1].log_posterior >= least else (0.0, None)
+    # Motion backwards is motion in other axes, too, of a vehicle that hardly turns.
+    same = {MOTION_AXES: (MOTION_AXES, BACKWARDS), MOTION_UNIT: (MOTION_UNIT,)}.get(best.supposition.code)
+    if same is not None:
+        rivals += [end for _, end in ends[1:] if end.supposition.code not in same]
+    if best.supposition.code == MOTION_UNIT:
+        # Of sweeps and images of other instants, less motion fits better, whatever the factor.
+        near = [tuple(step * f if f < 1.0 else 1.0 for f in factors) for factors in UNITS for step in (0.7, 1.4)]
+        rivals += [settled(MOTION_UNIT, _with_motion(part, np.eye(3), *factors)) for factors in near]
+    certain = best.log_posterior >= max(rival.log_posterior for rival in rivals) + log(LEAST_ODDS)
+    return (late_s, best) if certain else (0.0, None)
 
 
 def _other_pairing(data: WindowData) -> Ranked | None:
@@ -376,10 +413,12 @@ def _sweep_duration_s(data: WindowData) -> float:
     return 0.0 if sweep is None else sweep.period_s
 
 
-def _with_motion(data: WindowData, rotation: NDArray[np.float64]) -> WindowData:
-    """The window with the vectors of all motion multiplied by a matrix (3, 3)."""
+def _with_motion(
+    data: WindowData, rotation: NDArray[np.float64], linear: float = 1.0, angular: float = 1.0
+) -> WindowData:
+    """The window with the vectors of all motion multiplied by a matrix (3, 3) and by factors."""
     pairs = (
-        pair if pair.motion is None else replace(pair, motion=pair.motion.in_axes(rotation))
+        pair if pair.motion is None else replace(pair, motion=pair.motion.in_axes(rotation, linear, angular))
         for pair in data.window.pairs
     )
     return replace(data, window=replace(data.window, pairs=tuple(pairs)))
@@ -441,10 +480,11 @@ def _of_given(edges: Edges, rig: Rig, solved: Matrix4 | None) -> Ranked:
 def _ranked(edges: Edges, tried: Sequence[Supposition], given: Ranked) -> list[Ranked]:
     """The inputs as they would be without a mistake, the most probable first."""
     screened = sorted((_screened(edges, supposition) for supposition in tried), key=lambda one: -one.significance)
-    ascended = [_local_ascent(edges, one.supposition, one.starts) for one in screened[:ASCENDING]]
+    ascended = [_rezoomed(edges, one.supposition, one.starts, COARSER_ZOOMS) for one in screened[:ASCENDING]]
     best = sorted(ascended, key=lambda one: -one.significance)[:SETTLED]
     variants = Counter((one.code, one.also) for one in tried)
-    ends = [_settled(edges, one) for one in best]
+    finer = [_rezoomed(edges, one.supposition, [one.T_camera_lidar], FINER_ZOOMS) for one in best]
+    ends = [_settled(edges, one) for one in finer]
     least = LEAST_IN_VIEW * max(one.in_view for one in (given, *ends))
     return _with_priors([one for one in ends if one.in_view >= least], variants)
 
@@ -491,25 +531,44 @@ def _local_ascent(edges: Edges, supposition: Supposition, starts: Sequence[Matri
         ends = _ascended(frames, ends, step_rad)
     z = [frame_alignment(frames, end).significance for end in ends]
     best = int(np.argmax(z))
-    return Ranked(supposition, ends[best], z[best], 0.0, (0.0, 1.0), 0.0)
+    return Ranked(supposition, ends[best], z[best], 0.0, (np.zeros(cue.KINDS), np.ones(cue.KINDS)), 0.0)
 
 
-def _settled(edges: Edges, ascended: Ranked, null: tuple[float, float] | None = None) -> Ranked:
-    """The end of the local ascent on the finest edges. `null` are mean and deviation of z where nothing fits; None:
-    about the end."""
+def _rezoomed(edges: Edges, supposition: Supposition, starts: Sequence[Matrix4], zooms: Sequence[float]) -> Ranked:
+    """The best end of local ascents, also with focal lengths between those that are tried, if the supposition has
+    another one."""
+    ascended = _local_ascent(edges, supposition, starts)
+    if {supposition.code, supposition.also} & {FOCAL_LENGTH, RECTIFIED, DISTORTION}:
+        for step in zooms:
+            camera = ascended.supposition.camera
+            lenses = [replace(supposition, camera=zoomed(camera, zoom)) for zoom in (step, 1.0 / step)]
+            ends = (_local_ascent(edges, lens, (*starts, ascended.T_camera_lidar)) for lens in lenses)
+            ascended = max(ascended, *ends, key=lambda one: one.significance)
+    return ascended
+
+
+def _settled(edges: Edges, ascended: Ranked, null: Null | None = None) -> Ranked:
+    """The end of the local ascent on the finest edges. `null` as in `Ranked`; None: from poses about the end.
+
+    What the edges of range and those of reflectance are worth is open, so that the log-likelihoods of both add up.
+    """
     frames = edges.seen_by(ascended.supposition, FINEST, SETTLING_POINTS)
     (end,) = _ascended(frames, [ascended.T_camera_lidar], radians(0.08))
-    around, at = alignments(frames, _shell(end)), frame_alignment(frames, end)
+    kind = edges.kind[thinned(len(edges.kind), SETTLING_POINTS)]
+    sums = alignment_of_parts(frames, kind, cue.KINDS, np.concatenate([end[None], _shell(end)]))
+    of_kinds = sums.square.sum(axis=1)
+    z = sums.strength.sum(axis=1) / np.sqrt(np.maximum(of_kinds, LEAST_SQUARE))
+    square = of_kinds.sum(axis=1)
     # What looks past the points does not scatter.
-    square, in_view = around.square.sum(axis=1), float(at.square.sum())
-    looking = np.argsort(-square, kind="stable")[: max(LEAST_NULL, int((square > IN_VIEW * in_view).sum()))]
+    looking = (
+        1 + np.argsort(-square[1:], kind="stable")[: max(LEAST_NULL, int((square[1:] > IN_VIEW * square[0]).sum()))]
+    )
     if null is None:
-        z = np.array([around.at(int(pose)).significance for pose in looking])
-        null = float(z.mean()), max(1.0, float(z.std()))
-    significance = (at.significance - null[0]) / null[1]
-    log_posterior = 0.5 * max(significance, 0.0) ** 2 + log(AS_GIVEN_ODDS)
+        null = z[looking].mean(axis=0), np.maximum(1.0, z[looking].std(axis=0))
+    significance = float(np.linalg.norm(np.maximum((z[0] - null[0]) / null[1], 0.0)))
+    log_posterior = 0.5 * significance**2 + log(AS_GIVEN_ODDS)
     log_posterior += _log_prior_of_centre(ascended.supposition.camera)
-    return Ranked(ascended.supposition, end, significance, in_view, null, log_posterior)
+    return Ranked(ascended.supposition, end, significance, float(square[0]), null, log_posterior)
 
 
 def _ascended(frames: EdgeFrames, poses: Sequence[Matrix4], step_rad: float) -> list[Matrix4]:
@@ -522,9 +581,7 @@ def _with_priors(ranked: Sequence[Ranked], variants: Mapping[tuple[str, str], in
     from there, and on the odds of its kind, of which there are so many `variants`."""
     probable = []
     for one in ranked:
-        alike = [
-            other for other in ranked if _same_place(other, one) and other.supposition.camera == one.supposition.camera
-        ]
+        alike = [other for other in ranked if _same_place(other, one) and _same_lens(other, one)]
         best = max(alike, key=lambda other: other.significance)
         difference = se3.difference(best.T_camera_lidar, one.supposition.T_camera_lidar)
         away = (difference[:3] @ difference[:3]) / KNOWN_TO_RAD**2 + (difference[3:] @ difference[3:]) / KNOWN_TO_M**2
@@ -546,6 +603,13 @@ def _same_place(one: Ranked, other: Ranked) -> bool:
     return same_images and se3.rotation_angle_rad(one.T_camera_lidar @ se3.inverse(other.T_camera_lidar)) < SAME_RAD
 
 
+def _same_lens(one: Ranked, other: Ranked) -> bool:
+    """Whether the lenses of two suppositions displace no pixel noticeably against each other."""
+    a, b = one.supposition.camera, other.supposition.camera
+    shifts = ((a.cx - b.cx) / a.width, (a.cy - b.cy) / a.height, 0.5 * (a.fx / b.fx - 1.0), 0.5 * (a.fy / b.fy - 1.0))
+    return max(map(abs, shifts)) < NOTICEABLE and a == changed(b, fx=a.fx, fy=a.fy, cx=a.cx, cy=a.cy)
+
+
 def _moves(step_rad: float) -> NDArray[np.float64]:
     """(2, 12, 4, 4) a step either way along each axis of the camera, and half of it."""
     steps = se3.axis_steps(step_rad)
@@ -564,8 +628,8 @@ def _some_pairs(data: WindowData) -> WindowData:
     return replace(data, window=replace(data.window, pairs=tuple(pairs[index] for index in selected)))
 
 
-def _placed(data: WindowData, detected: Sequence[SweepEdges]) -> NDArray[np.float32]:
-    """(3, E) range edges of all pairs, motion-compensated."""
+def _placed(data: WindowData, detected: Sequence[cue.DetectedEdges]) -> NDArray[np.float32]:
+    """(3, E) edges of all pairs, motion-compensated."""
     placed = [data.points(frame, edges.index) + edges.shift_m for frame, edges in enumerate(detected)]
     return np.ascontiguousarray(np.concatenate(placed).T)
 
@@ -575,17 +639,27 @@ def _edges(data: WindowData) -> Edges | None:
     if len(data.window.pairs) < LEAST_PAIRS:
         return None
     part = _some_pairs(data)
-    detected = tuple(range_edges(scan_lines(pair.lidar.xyz_m, pair.lidar.ring)) for pair in part.window.pairs)
+    detected = tuple(cue.detected_edges(part.window.pairs))
     first = np.concatenate([[0], np.cumsum([len(edges.index) for edges in detected])]).astype(np.int64)
     if first[-1] == 0:
         return None
     camera, mask = part.window.rig.camera, part.window.rig.mask
     lit = mask if mask is not None else np.ones((camera.height, camera.width), np.bool_)
-    coarsest = max(LEVELS - 1, ceil(log2(COARSEST_BLUR_RAD / (BLUR_SIGMA_PX * pixel_rad(camera)))))
+    coarsest = max(LEVELS - 1, ceil(log2(cue.COARSEST_BLUR_RAD / (BLUR_SIGMA_PX * pixel_rad(camera)))))
     levels = range(coarsest + 1 - LEVELS, coarsest + 1)
     # No axis of the LiDAR is distinguished: which it is depends on the supposition.
     scales = EdgeScales(lit, levels[0], coarsest, upright=np.zeros(2))
     bands = [scales.pyramid(grey).bands for grey in part.greys()]
-    maps = tuple((level, np.stack([of_frame[k] for of_frame in bands])) for k, level in enumerate(levels))
-    weight = np.concatenate([edges.weight for edges in detected])
-    return Edges(_placed(part, detected), weight, first, maps, detected)
+    most = np.int8(cue.MOST_STRENGTH * STRENGTH_STEPS)
+    maps = tuple(
+        (level, np.minimum(np.stack([of_frame[k] for of_frame in bands]), most)) for k, level in enumerate(levels)
+    )
+    weight, kind = (np.concatenate([getattr(edges, of) for edges in detected]) for of in ("weight", "kind"))
+    return Edges(_placed(part, detected), _balanced(weight, kind), kind, first, maps, detected)
+
+
+def _balanced(weight: NDArray[np.float32], kind: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """The weights (E,), those of reflectance edges reduced as by `EdgeCue.balanced_by_power`."""
+    square = np.bincount(kind, weight.astype(np.float64) ** 2, minlength=cue.KINDS)
+    share = np.sqrt(square[cue.RANGE] / square[kind].clip(LEAST_SQUARE)) if square[cue.RANGE] else 1.0
+    return np.asarray(weight * np.minimum(share, 1.0), np.float32)

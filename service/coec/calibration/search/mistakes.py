@@ -38,8 +38,9 @@ QUATERNION_ORDER, CAMERA_AXES, INVERSE_AND_AXES = "quaternion_order", "camera_ax
 LIDAR_AXES, POSE_UNIT, CLOUD_FRAME = "lidar_axes", "pose_unit", "cloud_frame"
 FOCAL_LENGTH, IMAGE_SCALE, PRINCIPAL_POINT = "focal_length", "image_scale", "principal_point"
 FOCAL_LENGTHS_SWAPPED, CENTRE_SWAPPED, RECTIFIED = "focal_lengths_swapped", "centre_swapped", "rectified_image"
+DISTORTION = "distortion_missing"
 COMPENSATED, CLOCK_OFFSET = "already_compensated", "clock_offset"
-BACKWARDS, MOTION_AXES = "motion_backwards", "motion_axes"
+BACKWARDS, MOTION_AXES, MOTION_UNIT = "motion_backwards", "motion_axes", "motion_unit"
 TURNED_180, TURNED_90, MIRRORED = "image_turned_180", "image_turned_90", "image_mirrored"
 IMAGE_SIZE, OFF_BY_ONE = "image_size", "off_by_one"
 
@@ -113,6 +114,12 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
             "no distortion",
             "the images are probably rectified already: use the intrinsics of the rectified image, without distortion",
         ),
+        DISTORTION: Kind(
+            0.1,
+            "a distortion of the lens",
+            "the images are probably not rectified, and the intrinsics have no distortion: calibrate the lens, or give "
+            "the model and the distortion of its calibration",
+        ),
         TURNED_180: Kind(
             0.1,
             "the images turned by 180°",
@@ -140,6 +147,11 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
             "the motion in other axes",
             "the velocities of the vehicle are probably given in a frame with other axes than the one that they name "
             "(x forward, y left, z up): correct the frame, or turn the velocities",
+        ),
+        MOTION_UNIT: Kind(
+            0.1,
+            "the motion in another unit",
+            "the velocities of the vehicle are probably in km/h or in degrees per second: give m/s and rad/s",
         ),
         CLOCK_OFFSET: Kind(
             0.3,
@@ -189,6 +201,9 @@ DISTORTED = ("radtan", "rational", "kannala_brandt")
 RECTIFIED_ZOOMS = (1.0, 0.85, 0.72, 0.61, 0.52)
 """Ratios of the focal length of a rectified image to that of the raw one, which may be less, to hold more of the
 view."""
+
+BARRELS = ((-0.35, 0.15), (-0.2, 0.04))
+"""Radial terms k1 and k2 of common lenses: half of the view 45° and 30° wide."""
 
 LEAST_SCALE, OFF_MIDDLE = 0.1, 0.15
 """Least relative difference of the two sizes, and how far a principal point lies off the middle at most, as a share of
@@ -245,8 +260,9 @@ def suppositions_of_two(rig: Rig) -> list[Supposition]:
         if code in (INVERSE_POSE, QUATERNION_ORDER, CAMERA_AXES, INVERSE_AND_AXES):
             first = Supposition(code, rig.camera, T)
             scales = (replace(first, code=IMAGE_SCALE, camera=camera) for camera in _scaled(rig.camera))
+            zooms = (replace(first, code=FOCAL_LENGTH, camera=zoomed(rig.camera, zoom)) for zoom in ZOOMS[::2])
             # What is turned by 90° as well is rare, and fits by chance.
-            seconds = (*(one for one in _of_images(first) if one.code != TURNED_90), *scales)
+            seconds = (*(one for one in _of_images(first) if one.code != TURNED_90), *scales, *zooms)
             pairs += [replace(both, code=code, also=both.code) for both in seconds]
     return pairs
 
@@ -328,7 +344,7 @@ def _lenses(camera: Camera) -> Iterator[tuple[str, Camera]]:
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
     middle = (0.5 * (camera.width - 1.0), 0.5 * (camera.height - 1.0))
     for zoom in ZOOMS:
-        yield FOCAL_LENGTH, changed(camera, fx=zoom * fx, fy=zoom * fy)
+        yield FOCAL_LENGTH, zoomed(camera, zoom)
     for other in _scaled(camera):
         yield IMAGE_SCALE, other
     if off_middle(camera) > NOTICEABLE:
@@ -350,7 +366,17 @@ def _lenses(camera: Camera) -> Iterator[tuple[str, Camera]]:
     displaced_px = cameras.project_point(camera, *ray)[0] - cameras.project_point(pinhole, *ray)[0]
     if cameras.name_of(camera) in DISTORTED and abs(displaced_px) > NOTICEABLE * camera.width:
         for zoom in RECTIFIED_ZOOMS:
-            yield RECTIFIED, changed(pinhole, fx=zoom * fx, fy=zoom * fy)
+            yield RECTIFIED, zoomed(pinhole, zoom)
+    if abs(displaced_px) <= NOTICEABLE * camera.width:
+        of_pinhole = cameras.intrinsics_of(pinhole)
+        yield DISTORTION, cameras.build("kannala_brandt", **of_pinhole, k1=0.0, k2=0.0, k3=0.0, k4=0.0)
+        for k1, k2 in BARRELS:
+            yield DISTORTION, cameras.build("radtan", **of_pinhole, k1=k1, k2=k2, k3=0.0, p1=0.0, p2=0.0)
+
+
+def zoomed(camera: Camera, zoom: float) -> Camera:
+    """The camera with so many times its focal length."""
+    return changed(camera, fx=zoom * camera.fx, fy=zoom * camera.fy)
 
 
 def changed(camera: Camera, **intrinsics: float) -> Camera:

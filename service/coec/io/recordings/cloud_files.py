@@ -132,7 +132,8 @@ def _frame(
         next((columns[name] for name in names if name in columns), None) for names in (REFLECTANCE_FIELDS, _RINGS)
     )
     if ring is not None and (ring.dtype.kind not in "iu" or int(ring.max()) > 0xFFFF or int(ring.min()) < 0):
-        ring = ring if _are_rings(ring, xyz_m) else None
+        # Its name says that it holds rings; whether they are scan lines depends on the frame of the points.
+        ring = ring if _are_whole(ring) else None
     return LidarFrame(
         stamp_ns,
         frame_id,
