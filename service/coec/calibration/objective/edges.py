@@ -165,12 +165,9 @@ class EdgeCue:
         return self._weighted(gain / gain.max()) if gain.any() else self
 
     def balanced_by_power(self) -> EdgeCue:
-        """The cue with the weights of the reflectance edges reduced until their squares add to no more than those of
-        the range edges: if they fit nothing at all, the significance of the true pose falls by a root of two."""
-        square = [float((self.sharp.weight[self.kinds[0] == kind] ** 2).sum(dtype=np.float64)) for kind in range(KINDS)]
-        if square[RANGE] == 0.0 or square[REFLECTANCE] <= square[RANGE]:
-            return self
-        return self._weighted(np.array([1.0, math.sqrt(square[RANGE] / square[REFLECTANCE])]))
+        """The cue with the weights of each kind multiplied by `power_balance`."""
+        factors = power_balance(self.sharp.weight, self.kinds[0])
+        return self if (factors == 1.0).all() else self._weighted(factors)
 
     def _sums(self, level: EdgeFrames, T_camera_lidar: Matrix4) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         kinds = self.kinds[0] if len(self.kinds[0]) == len(level.weight) else self.kinds[1]
@@ -190,6 +187,16 @@ class EdgeCue:
             charts=_reweighted(self.charts, ranked),
             thinned=_reweighted(self.thinned, few),
         )
+
+
+def power_balance(weight: NDArray[np.float32], kinds: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """(KINDS,) factors of the weights (E,) of edges of some kinds (E,) before a pose is known: those of reflectance
+    edges are reduced until their squares add to no more than those of the range edges. So if they fit nothing at all,
+    the significance of the true pose falls by a root of two."""
+    square = [float((weight[kinds == kind] ** 2).sum(dtype=np.float64)) for kind in range(KINDS)]
+    if square[RANGE] == 0.0 or square[REFLECTANCE] <= square[RANGE]:
+        return np.ones(KINDS)
+    return np.array([1.0, math.sqrt(square[RANGE] / square[REFLECTANCE])])
 
 
 def _reweighted(charts: tuple[EdgeCharts, EdgeCharts], factors: NDArray[np.float32]) -> tuple[EdgeCharts, EdgeCharts]:

@@ -159,6 +159,7 @@ SAME_RAD = radians(5.0)
 
 
 Null = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Mean and standard deviation of the z of each kind of edges where nothing fits, (KINDS,) each."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,7 +170,7 @@ class Ranked:
         T_camera_lidar: (4, 4) that pose.
         significance: of the edges there, in units of its scatter.
         in_view: Σ w² of the range edges in view there.
-        null: mean and standard deviation of the z of each kind of edges where nothing fits.
+        null: what its significance was measured against.
         log_posterior: up to a constant.
     """
 
@@ -655,11 +656,5 @@ def _edges(data: WindowData) -> Edges | None:
         (level, np.minimum(np.stack([of_frame[k] for of_frame in bands]), most)) for k, level in enumerate(levels)
     )
     weight, kind = (np.concatenate([getattr(edges, of) for edges in detected]) for of in ("weight", "kind"))
-    return Edges(_placed(part, detected), _balanced(weight, kind), kind, first, maps, detected)
-
-
-def _balanced(weight: NDArray[np.float32], kind: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """The weights (E,), those of reflectance edges reduced as by `EdgeCue.balanced_by_power`."""
-    square = np.bincount(kind, weight.astype(np.float64) ** 2, minlength=cue.KINDS)
-    share = np.sqrt(square[cue.RANGE] / square[kind].clip(LEAST_SQUARE)) if square[cue.RANGE] else 1.0
-    return np.asarray(weight * np.minimum(share, 1.0), np.float32)
+    weight *= cue.power_balance(weight, kind)[kind].astype(np.float32)
+    return Edges(_placed(part, detected), weight, kind, first, maps, detected)
