@@ -34,7 +34,7 @@ from coec.service.api.pair_answers import PairAnswers, PendingPairAnswers
 from coec.service.api.problems import RouterMonitor
 from coec.service.api.reply_builders import SerializedReply, budget_status_of, worker_status_of
 from coec.service.api.rig_answers import RigAnswers
-from coec.service.api.routes import VehicleRoutes
+from coec.service.api.routes import VehicleReplies, VehicleRoutes
 from coec.service.api.uplink import Heartbeats, Uplink
 from coec.service.camera_lidar_pair import CameraLidarPair
 from coec.service.configuration import redacted_configuration, reload_of, settings_hash
@@ -123,9 +123,7 @@ class Daemon:
         self._ros_side = RosSide(session, config)
         self._presence = SingletonGuard(session, config.zenoh, config.limits, self._keys, self._started_ns)
         self._router = RouterMonitor([redacted(endpoint) for endpoint in endpoints], self._bus.reaches_somebody)
-        self._metrics_server = MetricsServer(
-            pages(self._metrics, lambda: self._status_reply, self._health, self._is_alive)
-        )
+        self._metrics_server = MetricsServer(pages(self._metrics, self._health, self._is_alive))
         node = self._ros_side.node
         publishers = None if node is None else RosPublishers(session, node)
         self._ros_outputs = RosOutputs(publishers, config, self._worker)
@@ -171,25 +169,23 @@ class Daemon:
             **{name: pair.commands for name, pair in self._pairs.items()},
             **{name: answers.commands for name, answers in pending.items()},
         }
-        of_rig = RigCommands(config.vehicle, self._commands, lambda: self._rig_answers.reply)
+        of_rig = RigCommands(config.vehicle, self._commands, self._rig_answers)
         self._command_handler = CommandHandler(self._rules, self._commands, of_rig)
         self._configuration = replies.ConfigurationStatus(read_ns=self._started_ns)
         self._heartbeats = Heartbeats(self._keys, __version__, config.uplink, self._bus.publish)
         self._uplink = Uplink(config.uplink)
+        self._status = self._status_now()
+        self._replies = VehicleReplies(SerializedReply.of(self._status), self._config_reply())
         self._answers = VehicleRoutes(
             self._keys,
             {**{name: pair.answers for name, pair in self._pairs.items()}, **pending},
             self._command_handler,
-            lambda: self._status,
+            self._replies,
             self._metrics,
-            lambda: self._shown,
             self._rig_answers,
             self._heartbeats,
             self._uplink,
         )
-        self._status_reply = self._status_now()
-        self._status = SerializedReply.of(self._status_reply)
-        self._shown = self._shown_now()
 
     def serve(self, signals: Signals, reread: Callable[[], Config] | None) -> int:
         """Run until a signal or a fault; returns the exit status."""
@@ -234,7 +230,7 @@ class Daemon:
         self._pending_pairs.listen(self._bus, self._ros_side)
         for name in (each.name for each in self._config.every_pair):
             self._bus.declare_alive(self._keys.alive(name))
-        fields = {"vehicle": self._config.vehicle, "config_hash": self._status_reply.config_hash}
+        fields = {"vehicle": self._config.vehicle, "config_hash": self._status.config_hash}
         _log.info(
             "serving",
             extra={
@@ -249,7 +245,8 @@ class Daemon:
 
     def _subscribe(self) -> None:
         """Subscribes to the streams of all pairs that are not subscribed to yet."""
-        self._vehicle.listen(lambda stream, take: self._bus.subscribe(self._ros_side.input_of(stream), take))
+        for stream, take in self._vehicle.new_streams():
+            self._bus.subscribe(self._ros_side.input_of(stream), take)
 
     def _admit(self) -> None:
         """Builds and starts the awaited pairs whose configuration is complete by now."""
@@ -267,7 +264,7 @@ class Daemon:
             self._answers.replace(pair.answers)
         self._subscribe()
         self._command_handler.reconfigure(self._rules)  # for the commands of new pairs, too
-        self._shown = self._shown_now()
+        self._replies.config = self._config_reply()
         fields = {"pairs": list(discovered), "config_hash": config_hash(self._config)}
         _log.info("discovered pairs are served", extra={"fields": fields})
 
@@ -414,7 +411,7 @@ class Daemon:
         self._budget.reconfigure(config.budget)
         self._uplink.reconfigure(config.uplink)
         self._heartbeats.reconfigure(config.uplink)
-        self._shown = self._shown_now()
+        self._replies.config = self._config_reply()
         for old, new in zip(before.pairs, config.pairs, strict=True):
             if old == new and before.stale_after_s == config.stale_after_s:
                 continue
@@ -462,9 +459,9 @@ class Daemon:
 
     def _renew(self) -> None:
         self._pending_pairs.renew()
-        self._status_reply = self._status_now()
-        self._status = SerializedReply.of(self._status_reply)
-        self._heartbeats.renew(self._state, self._status_reply.config_hash, self._answering())
+        self._status = self._status_now()
+        self._replies.status = SerializedReply.of(self._status)
+        self._heartbeats.renew(self._state, self._status.config_hash, self._answering())
 
     def _status_now(self) -> replies.StatusReply:
         usage = self._folder.usage()
@@ -489,7 +486,7 @@ class Daemon:
             queries_waiting=self._bus.waiting,
         )
 
-    def _shown_now(self) -> SerializedReply:
+    def _config_reply(self) -> SerializedReply:
         """The configuration as it is served."""
         return SerializedReply.of_document(
             {
@@ -514,8 +511,9 @@ class Daemon:
             self._rig_answers.reply if len(self._pairs) > 1 else None,
         )
 
-    def _health(self) -> dict[str, replies.HealthReply]:
-        return {answers.name: answers.health_reply for answers in self._answering()}
+    def _health(self) -> tuple[replies.StatusReply, dict[str, replies.HealthReply]]:
+        """The status of the service, and the health of every pair."""
+        return self._status, {answers.name: answers.health_reply for answers in self._answering()}
 
     def _answering(self) -> list[PairAnswers | PendingPairAnswers]:
         """The answers of every pair: running pairs first, then the awaited ones."""
@@ -538,7 +536,7 @@ class Daemon:
             metrics.WORK: [LabelledHistogram((), self._worker.work_took)],
         }
         memory = (system.resident_bytes(), self._worker.status().rss_bytes)
-        view = MetricsInput(self._status_reply, self._health(), *memory, took, self._rig_answers.reply, self._uplink)
+        view = MetricsInput(*self._health(), *memory, took, self._rig_answers.reply, self._uplink)
         return metrics.render(view, text_format)
 
 

@@ -44,7 +44,7 @@ def serving(host: str, *, alive: bool = True) -> Iterator[tuple[str, int]]:
     """The pages of a service whose only pair is miscalibrated, and whether it makes progress."""
     health = {"front": a_health("miscalibrated", 2)}
     address = host, free_port()
-    server = HttpServer(*address, pages(lambda _: b"", a_busy_status, lambda: health, lambda: alive))
+    server = HttpServer(*address, pages(lambda _: b"", lambda: (a_busy_status(), health), lambda: alive))
     server.thread.start()
     try:
         yield address

@@ -68,7 +68,8 @@ def test_what_zenoh_drops_is_counted_as_far_as_it_can_be_known(
         connected([endpoint], PATIENCE_S) as session,
     ):
         publishers = {}
-        vehicle.bench.vehicle.listen(lambda stream, take: vehicle.bus.subscribe(on_key(stream.place), take))
+        for known, take in vehicle.bench.vehicle.new_streams():
+            vehicle.bus.subscribe(on_key(known.place), take)
         for name in counted:
             block = zenoh.CongestionControl.BLOCK
             publishers[name] = session.declare_publisher(f"in/{name}", congestion_control=block)

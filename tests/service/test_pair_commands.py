@@ -23,7 +23,7 @@ from coec.service.api import command_execution
 from coec.service.api.authorization import Authority, CommandHandler, CommandRules
 from coec.service.api.reply_builders import SerializedReply
 from coec.service.api.rig_answers import RigAnswers
-from coec.service.api.routes import VehicleRoutes
+from coec.service.api.routes import VehicleReplies, VehicleRoutes
 from coec.service.api.uplink import Heartbeats, Uplink
 from coec.service.engine.messages import CommissioningSubject, JobDone
 from coec.service.worker.worker_jobs import Commissioned, Fate, JobOutcome, Kind, WorkerJob
@@ -281,9 +281,8 @@ def route_of(bench: PairBench, command: str) -> Route:
         keys,
         {pair.name: pair.answers},
         command_handler,
-        lambda: unasked,
+        VehicleReplies(unasked, unasked),
         lambda: b"",
-        lambda: unasked,
         RigAnswers(keys, lambda *_: None),
         Heartbeats(keys, "0", UplinkConfig(), lambda *_: None),
         Uplink(UplinkConfig()),

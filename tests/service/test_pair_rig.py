@@ -135,7 +135,7 @@ class RigBench:
     def do(self, name: str, **arguments: Any) -> Acknowledgement:
         """A command for the rig."""
         commands = {name: pair.commands for name, pair in self.pairs.items()}
-        rig = RigCommands("test", commands, lambda: self.reply)
+        rig = RigCommands("test", commands, self.answers)
         with ThreadPoolExecutor(1) as other:
             report = other.submit(rig.carry_out, name, arguments, "the test")
             while not report.done():

@@ -58,7 +58,7 @@ from coec.service import camera_lidar_pair as runtime_pair
 from coec.service.api.authorization import Authority, CommandHandler, CommandRules
 from coec.service.api.reply_builders import SerializedReply
 from coec.service.api.rig_answers import RigAnswers
-from coec.service.api.routes import VehicleRoutes
+from coec.service.api.routes import VehicleReplies, VehicleRoutes
 from coec.service.api.uplink import Heartbeats, Uplink
 from coec.service.camera_lidar_pair import CameraLidarPair
 from coec.service.configuration import redacted_configuration
@@ -538,20 +538,15 @@ def serve(bench: PairBench, config: ZenohConfig, bus: Bus) -> ServingVehicle:
     document = SerializedReply.of_document(
         {"schema_version": 1, "config_hash": "0", "config": redacted_configuration(bench.config)}
     )
-
-    def status() -> SerializedReply:
-        reply = status_reply(vehicle=VEHICLE, pairs=(pair.answers.status(),))
-        return SerializedReply.of(reply)
-
+    status = SerializedReply.of(status_reply(vehicle=VEHICLE, pairs=(pair.answers.status(),)))
     uplink = Uplink(UplinkConfig())
     heartbeats = Heartbeats(KEYS, "0", UplinkConfig(), bus.publish)
     VehicleRoutes(
         KEYS,
         {pair.name: pair.answers},
         command_handler,
-        status,
+        VehicleReplies(status, document),
         lambda: b"# EOF\n",
-        lambda: document,
         RigAnswers(KEYS, bus.publish),
         heartbeats,
         uplink,

@@ -21,7 +21,7 @@ from support.router import free_port
 
 def health_page(state: str, **healths: tuple[str, int]) -> HttpResponse:
     known = {name: a_health(*health) for name, health in healths.items()}
-    page = pages(lambda _: b"", lambda: a_busy_status(state), lambda: known, lambda: True)(HttpRequest("/health"))
+    page = pages(lambda _: b"", lambda: (a_busy_status(state), known), lambda: True)(HttpRequest("/health"))
     assert page is not None
     return page
 
@@ -36,7 +36,7 @@ def test_health_is_good_when_every_pair_may_be_used() -> None:
 
 
 def test_there_are_three_pages() -> None:
-    find = pages(lambda form: form.name.encode(), a_busy_status, dict, lambda: True)
+    find = pages(lambda form: form.name.encode(), lambda: (a_busy_status(), {}), lambda: True)
     plain, requested = find(HttpRequest("/metrics")), find(HttpRequest("/metrics", "application/openmetrics-text"))
     assert plain is not None
     assert requested is not None
@@ -48,7 +48,7 @@ def test_there_are_three_pages() -> None:
 
 @pytest.mark.parametrize(("alive", "status"), [(True, 200), (False, 503)])
 def test_a_service_that_is_stuck_is_not_alive_whatever_its_pairs_are(alive: bool, status: int) -> None:
-    page = pages(lambda _: b"", a_busy_status, dict, lambda: alive)(HttpRequest("/live"))
+    page = pages(lambda _: b"", lambda: (a_busy_status(), {}), lambda: alive)(HttpRequest("/live"))
     assert page is not None
     assert page.status == status
 

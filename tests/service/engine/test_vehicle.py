@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, FramePair, ImageFormat, LidarFrame
-from coec.config import Config, KnownStreamConfig, PairConfig
+from coec.config import Config, PairConfig
 from coec.io.disk_writer import DiskWriter
 from coec.io.logs import LossCounter
 from coec.io.msgpack_frames import encode_camera, encode_ego, encode_lidar
@@ -125,14 +125,9 @@ class VehicleBench:
         self.pairs[name] = ObservedPair(pair, self.config, self.engine, self.observations[name])
 
     def listen(self) -> list[str]:
-        subscribed: list[str] = []
-
-        def subscribe(stream: KnownStreamConfig, take: Callable[[InputSample], None]) -> None:
-            subscribed.append(stream.place)
-            self.received[stream.place] = take
-
-        self.engine.listen(subscribe)
-        return subscribed
+        streams = {stream.place: take for stream, take in self.engine.new_streams()}
+        self.received.update(streams)
+        return list(streams)
 
     def put(self, key: str, frame: CameraFrame | LidarFrame | EgoMotion | bytes) -> None:
         match frame:

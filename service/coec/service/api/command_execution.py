@@ -19,7 +19,7 @@ from typing import Any
 from coec.errors import CoecError, NotFoundError
 from coec.schemas.commands import CANDIDATE, COMMAND_NAMES, REASON, Acknowledgement
 from coec.schemas.keys import RIG
-from coec.schemas.rig_state import RigReply
+from coec.service.api.rig_answers import RigAnswers
 from coec.service.engine.commands import EXPIRED, PairCommand
 from coec.service.ingest.inbox import STARTED, BusyError, Inbox
 from coec.service.records.pair_store import PairStore
@@ -190,8 +190,8 @@ PairCommands = Commands | PendingPairCommands
 class RigCommands:
     """The rig commands of one vehicle. `pairs` may gain pairs while commands come."""
 
-    def __init__(self, vehicle: str, pairs: Mapping[str, PairCommands], rig: Callable[[], RigReply]) -> None:
-        """`rig()` gives the reply that names the pairs of each sensor."""
+    def __init__(self, vehicle: str, pairs: Mapping[str, PairCommands], rig: RigAnswers) -> None:
+        """The reply of `rig` names the pairs of each sensor."""
         self._vehicle = vehicle
         self._pairs = pairs
         self._rig = rig
@@ -238,7 +238,7 @@ class RigCommands:
     def _pairs_of(self, sensor: str | None) -> tuple[str, ...]:
         if sensor is None:
             return tuple(self._pairs)
-        sensors = {one.name: one.pairs for one in self._rig().sensors}
+        sensors = {one.name: one.pairs for one in self._rig.reply.sensors}
         if sensor not in sensors:
             raise NotFoundError(f"no such sensor; the rig has {', '.join(sensors)}")
         return tuple(pair for pair in sensors[sensor] if pair in self._pairs)

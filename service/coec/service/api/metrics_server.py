@@ -238,8 +238,7 @@ USABLE_LEVELS = frozenset({0, 1})
 
 def pages(
     metrics: Callable[[TextFormat], bytes],
-    status: Callable[[], StatusReply],
-    health: Callable[[], Mapping[str, HealthReply]],
+    health: Callable[[], tuple[StatusReply, Mapping[str, HealthReply]]],
     is_alive: Callable[[], bool],
 ) -> Callable[[HttpRequest], HttpResponse | None]:
     """A function that makes the page of a request (None for an unknown path).
@@ -255,7 +254,7 @@ def pages(
                 text_format = accepted_format(request.accept)
                 return HttpResponse(200, metrics(text_format), text_format.value)
             case "/health":
-                return _health(status(), health())
+                return _health(*health())
             case "/live":
                 alive = is_alive()
                 return HttpResponse(

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import zenoh
@@ -28,6 +28,18 @@ AnyPairAnswers = PairAnswers | PendingPairAnswers
 """What answers about a pair."""
 
 
+@dataclass(slots=True)
+class VehicleReplies:
+    """The latest replies about the vehicle. One thread replaces them whole, any thread reads them.
+
+    Attributes:
+        status, config: the status of the service and its configuration.
+    """
+
+    status: SerializedReply
+    config: SerializedReply
+
+
 class VehicleRoutes:
     """Routes of the vehicle and of each of its pairs.
 
@@ -40,14 +52,13 @@ class VehicleRoutes:
         keys: bus_keys.Keys,
         pairs: Mapping[str, AnyPairAnswers],
         command_handler: CommandHandler,
-        status: Callable[[], SerializedReply],
+        vehicle: VehicleReplies,
         metrics: Callable[[], bytes],
-        config: Callable[[], SerializedReply],
         rig: RigAnswers,
         heartbeats: Heartbeats,
         uplink: Uplink,
     ) -> None:
-        """`status()` and `config()` are serialised in advance; `metrics()` is rendered when it is asked for."""
+        """`metrics()` is rendered when it is asked for."""
         self.took = Histogram(QUICK_S)
         self._keys = keys
         self._pairs = dict(pairs)
@@ -55,8 +66,8 @@ class VehicleRoutes:
         self._heartbeats = heartbeats
         self._uplink = uplink
         self._vehicle_routes = {
-            keys.status: Route(keys.status, lambda request: status().answer(_format(request)), QueryLane.AT_ONCE),
-            keys.config: Route(keys.config, lambda request: config().answer(_format(request)), QueryLane.AT_ONCE),
+            keys.status: Route(keys.status, lambda request: vehicle.status.answer(_format(request)), QueryLane.AT_ONCE),
+            keys.config: Route(keys.config, lambda request: vehicle.config.answer(_format(request)), QueryLane.AT_ONCE),
             keys.rig: Route(keys.rig, lambda request: rig.answer(_format(request)), QueryLane.AT_ONCE),
             keys.metrics: Route(keys.metrics, lambda _: Answer(metrics(), metrics_text.ENCODING), QueryLane.FILES),
         }

@@ -136,11 +136,10 @@ class Vehicle:
         """A receiver takes part from now on."""
         self.inbox.post("", receiver)
 
-    def listen(self, subscribe: Callable[[KnownStreamConfig, Callable[[InputSample], None]], object]) -> None:
-        """Subscribe to each stream that nobody has subscribed to yet."""
+    def new_streams(self) -> list[tuple[KnownStreamConfig, Callable[[InputSample], None]]]:
+        """The streams that no earlier call has returned, each with the function that takes its samples."""
         unsubscribed, self._unsubscribed = self._unsubscribed, []
-        for sensor in unsubscribed:
-            subscribe(sensor.config, self.inbox.receiver(sensor.number))
+        return [(sensor.config, self.inbox.receiver(sensor.number)) for sensor in unsubscribed]
 
     # --- on any -----------------------------------------------------------------------------------------------------
 
