@@ -21,7 +21,6 @@ from coec.config import UplinkConfig, ZenohConfig
 from coec.errors import NotFoundError, RemoteError, UsageError
 from coec.io.images import encode_jpeg
 from coec.io.mcap.windows import WindowWriter, write_result
-from coec.io.zenoh.bus import Answer
 from coec.io.zenoh.query_client import PIECE_BYTES, SPARE_BYTES, NoSpaceError, RecordingInfo, connected, fetch_window
 from coec.schemas.documents import IncidentReport
 from coec.schemas.keys import Keys, parse_range_selector
@@ -166,7 +165,7 @@ def test_whatever_is_fetched_is_metered_and_waited_for(
 ) -> None:
     before = dict(vehicle.uplink.sent)
     vehicle.uplink.reconfigure(UplinkConfig(evidence_bytes_per_s=1_000_000))
-    vehicle.uplink.metered("test", lambda: Answer(bytes(BURST_BYTES + 300_000), ""))
+    vehicle.uplink.count_sent("test", BURST_BYTES + 300_000)
     outcome = coec("fetch", VEHICLE, "latest", "--connect", router.endpoint, "--output", tmp_path, "--json")
     assert outcome.status == 0, outcome.err
     report = IncidentReport.model_validate(outcome.document)

@@ -229,6 +229,7 @@ def write(folder: Path) -> dict[str, Any]:
     for rig, (state, made) in ((FRONT, front_state()), (REAR, rear_state())):
         books, texts = write_history(folder, rig, state)
         heads = books.durable_heads if hasattr(books, "durable_heads") else books.durable_head
+        heads = heads() if callable(heads) else heads
         by_call = "Callable" in str(inspect.signature(update).parameters.get("history_heads"))
         clocks = Clocks(6 * S, 8 * S, 4 * S)
         more = {"commissioned_from": (f"{rig.pair}-1",)}

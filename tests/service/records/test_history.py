@@ -58,7 +58,7 @@ def test_no_flood_pushes_a_result_or_what_it_put_in_place_out(tmp_path: Path, fl
     for _ in range(5 * LIMIT):
         history.append(flood)
     history.flush()
-    for one in (history, PairHistory(tmp_path, "front", LIMIT, history.durable_heads)):
+    for one in (history, PairHistory(tmp_path, "front", LIMIT, history.durable_heads())):
         assert one.damage is None
         assert one.results() == (result,)
         assert [retained.entry.code for retained in one.entries()] == ["accepted", "estimated", *[flood.code] * LIMIT]
@@ -81,7 +81,7 @@ def test_entries_are_numbered_together_in_the_order_in_which_they_arrived(tmp_pa
     for kind in kinds[:3]:
         history.append(entry(kind))
     history.flush()
-    history = PairHistory(tmp_path, "front", LIMIT, history.durable_heads)
+    history = PairHistory(tmp_path, "front", LIMIT, history.durable_heads())
     for kind in kinds[3:]:
         history.append(entry(kind))
     reported = [(retained.entry.sequence, retained.entry.kind) for retained in history.entries()]
@@ -95,7 +95,7 @@ def test_a_book_that_was_cut_or_removed_is_noticed(tmp_path: Path, book: str) ->
         history.append(entry(kind))
     history.flush()
     (tmp_path / f"{book}-front.jsonl").unlink()
-    assert "cut off" in str(PairHistory(tmp_path, "front", LIMIT, history.durable_heads).damage)
+    assert "cut off" in str(PairHistory(tmp_path, "front", LIMIT, history.durable_heads()).damage)
 
 
 @pytest.mark.fault("a forged pose in the history, hashes right", "it is damage, and not used")
@@ -121,7 +121,7 @@ def test_every_book_waits_for_a_full_disk_and_is_written_then(tmp_path: Path, mo
     disk.refuses = ()
     history.flush()
     state = StateFile(tmp_path / "state.json")
-    state.save({"heads": history.durable_heads})
+    state.save({"heads": history.durable_heads()})
     body = StateFile(tmp_path / "state.json").load().body
     assert body is not None
     again = PairHistory(tmp_path, "front", LIMIT, body["heads"])

@@ -403,8 +403,12 @@ class PendingPairAnswers:
         self._since_ns = time.time_ns()
         self._published: object = None
         self._fault: tuple[Reason, ...] = ()
-        self.commands = PendingPairCommands(pair.name, vehicle, lambda: PendingPairError(_sentence(self._nominal)))
+        self.commands = PendingPairCommands(pair.name, vehicle, self._missing)
         self.renew()
+
+    def _missing(self) -> PendingPairError:
+        awaits = (reason.text for reason in self._nominal.awaits)
+        return PendingPairError(" ".join(["This pair waits for its nominal calibration.", *awaits]))
 
     @property
     def _nominal(self) -> NominalStatus:
@@ -468,8 +472,4 @@ class PendingPairAnswers:
         Raises:
             PendingPairError: there is no nominal calibration yet.
         """
-        raise PendingPairError(_sentence(self._nominal))
-
-
-def _sentence(nominal: NominalStatus) -> str:
-    return " ".join(["This pair waits for its nominal calibration.", *(reason.text for reason in nominal.awaits)])
+        raise self._missing()

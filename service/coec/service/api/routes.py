@@ -66,10 +66,10 @@ class VehicleRoutes:
         self._heartbeats = heartbeats
         self._uplink = uplink
         self._vehicle_routes = {
-            keys.status: Route(keys.status, lambda request: vehicle.status.answer(_format(request)), QueryLane.AT_ONCE),
-            keys.config: Route(keys.config, lambda request: vehicle.config.answer(_format(request)), QueryLane.AT_ONCE),
-            keys.rig: Route(keys.rig, lambda request: rig.answer(_format(request)), QueryLane.AT_ONCE),
-            keys.metrics: Route(keys.metrics, lambda _: Answer(metrics(), metrics_text.ENCODING), QueryLane.FILES),
+            keys.status: Route(keys.status, partial(_status, vehicle), QueryLane.AT_ONCE),
+            keys.config: Route(keys.config, partial(_config, vehicle), QueryLane.AT_ONCE),
+            keys.rig: Route(keys.rig, partial(_rig, rig), QueryLane.AT_ONCE),
+            keys.metrics: Route(keys.metrics, partial(_metrics, metrics), QueryLane.FILES),
         }
         self._pair_routes = {name: self._readable(pair) for name, pair in pairs.items()}
 
@@ -81,7 +81,7 @@ class VehicleRoutes:
         """Serves everything on the bus. The last queryable answers for keys of pairs that do not exist. It does not
         claim to be `complete`, so that it takes no query away from another service of the vehicle."""
         for key, route in self._vehicle_routes.items():
-            bus.serve(key, _always(self._timed(route, key.rpartition("/")[2])))
+            bus.serve(key, partial(_always, self._timed(route, key.rpartition("/")[2])))
         for name in self._pairs:
             bus.serve(f"{self._keys.root}/{name}/**", self._finder(name))
         bus.serve(f"{self._keys.rig}/**", self._find_of_rig)
@@ -128,11 +128,11 @@ class VehicleRoutes:
             )
         address = self._keys.parse(key)
         if address.resource == "windows" and address.argument is not None:
-            return [self._metered(Route(key, self._window(self._pairs[pair], address.argument), QueryLane.FILES))]
+            return [self._metered(Route(key, partial(_window, self._pairs[pair], address.argument), QueryLane.FILES))]
         if address.resource == "command":
             return [Route(key, partial(self._command_handler.handle, pair, str(address.argument)), QueryLane.COMMANDS)]
         if address.resource == "evidence" and address.argument is not None:
-            return [self._metered(Route(key, self._evidence(self._pairs[pair], address.argument), QueryLane.FILES))]
+            return [self._metered(Route(key, partial(_event, self._pairs[pair], address.argument), QueryLane.FILES))]
         raise UsageError("`alive` is a liveliness token: ask for liveliness")
 
     def _find_of_rig(self, key: str) -> Sequence[Route]:
@@ -155,7 +155,7 @@ class VehicleRoutes:
         """A function that finds the route for the last word of a pair, for queries of that word or of all last words.
         It finds none for queries of something else about a pair that happens to be called `last`."""
         route = self._timed(Route(self._keys.last(pair), partial(self._last, pair), QueryLane.AT_ONCE), bus_keys.LAST)
-        return lambda key: [route] if key.split("/")[-2] == bus_keys.LAST else []
+        return partial(_of_last_word, route)
 
     def _last(self, pair: str, request: Request) -> Answer:
         return self._heartbeats.answer(pair, _format(request))
@@ -174,39 +174,67 @@ class VehicleRoutes:
     def _readable(self, pair: AnyPairAnswers) -> dict[str, Route]:
         keys, name = self._keys, pair.name
         routes = (
-            Route(keys.extrinsic(name), lambda request: _extrinsic(pair, request), QueryLane.AT_ONCE),
-            Route(keys.health(name), lambda request: pair.health(_format(request)), QueryLane.AT_ONCE),
-            self._metered(Route(keys.history(name), lambda request: _history(pair, request), QueryLane.FILES)),
-            Route(keys.windows(name), lambda request: pair.calibrated.windows(_format(request)), QueryLane.FILES),
-            Route(
-                keys.evidence(name),
-                lambda request: answer_of(pair.calibrated.events(), _format(request)),
-                QueryLane.FILES,
-            ),
-            self._metered(Route(keys.overlay(name), lambda request: _overlay(pair, request), QueryLane.DRAWING)),
+            Route(keys.extrinsic(name), partial(_extrinsic, pair), QueryLane.AT_ONCE),
+            Route(keys.health(name), partial(_health, pair), QueryLane.AT_ONCE),
+            self._metered(Route(keys.history(name), partial(_history, pair), QueryLane.FILES)),
+            Route(keys.windows(name), partial(_windows, pair), QueryLane.FILES),
+            Route(keys.evidence(name), partial(_events, pair), QueryLane.FILES),
+            self._metered(Route(keys.overlay(name), partial(_overlay, pair), QueryLane.DRAWING)),
         )
         return {route.key: route for route in routes}
 
     def _metered(self, route: Route) -> Route:
         """The same route, as far as the uplink allows."""
         resource = self._keys.parse(route.key).resource
-        return replace(route, answer=lambda request: self._uplink.metered(resource, lambda: route.answer(request)))
 
-    def _window(self, pair: AnyPairAnswers, window_id: str) -> Callable[[Request], Answer]:
         def answer(request: Request) -> Answer:
-            selector = bus_keys.parse_range_selector(request.parameters)
-            return Answer(pair.calibrated.read_window(window_id, selector.offset, selector.length), OCTETS)
+            self._uplink.admit(resource)
+            answer = route.answer(request)
+            self._uplink.count_sent(resource, len(answer.payload))
+            return answer
 
-        return answer
+        return replace(route, answer=answer)
 
-    def _evidence(self, pair: AnyPairAnswers, event_id: str) -> Callable[[Request], Answer]:
-        def answer(request: Request) -> Answer:
-            selector = bus_keys.parse_evidence_selector(request.parameters)
-            if selector.overlay is not None:
-                return Answer(pair.calibrated.event_overlay(event_id, selector.overlay), JPEG)
-            return answer_of(pair.calibrated.event(event_id), selector.format)
 
-        return answer
+def _status(vehicle: VehicleReplies, request: Request) -> Answer:
+    return vehicle.status.answer(_format(request))
+
+
+def _config(vehicle: VehicleReplies, request: Request) -> Answer:
+    return vehicle.config.answer(_format(request))
+
+
+def _rig(rig: RigAnswers, request: Request) -> Answer:
+    return rig.answer(_format(request))
+
+
+def _metrics(metrics: Callable[[], bytes], request: Request) -> Answer:
+    del request
+    return Answer(metrics(), metrics_text.ENCODING)
+
+
+def _health(pair: AnyPairAnswers, request: Request) -> Answer:
+    return pair.health(_format(request))
+
+
+def _windows(pair: AnyPairAnswers, request: Request) -> Answer:
+    return pair.calibrated.windows(_format(request))
+
+
+def _window(pair: AnyPairAnswers, window_id: str, request: Request) -> Answer:
+    selector = bus_keys.parse_range_selector(request.parameters)
+    return Answer(pair.calibrated.read_window(window_id, selector.offset, selector.length), OCTETS)
+
+
+def _events(pair: AnyPairAnswers, request: Request) -> Answer:
+    return answer_of(pair.calibrated.events(), _format(request))
+
+
+def _event(pair: AnyPairAnswers, event_id: str, request: Request) -> Answer:
+    selector = bus_keys.parse_evidence_selector(request.parameters)
+    if selector.overlay is not None:
+        return Answer(pair.calibrated.event_overlay(event_id, selector.overlay), JPEG)
+    return answer_of(pair.calibrated.event(event_id), selector.format)
 
 
 def _extrinsic(pair: AnyPairAnswers, request: Request) -> Answer:
@@ -230,8 +258,13 @@ def _format(request: Request) -> bus_keys.Format:
     return bus_keys.parse_selector(request.parameters).format
 
 
-def _always(route: Route) -> Callable[[str], Sequence[Route]]:
-    return lambda _: [route]
+def _always(route: Route, key: str) -> Sequence[Route]:
+    del key
+    return [route]
+
+
+def _of_last_word(route: Route, key: str) -> Sequence[Route]:
+    return [route] if key.split("/")[-2] == bus_keys.LAST else []
 
 
 def _has_wildcard(key: str) -> bool:

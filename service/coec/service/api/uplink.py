@@ -171,8 +171,8 @@ class Uplink:
         with self._lock:
             return dict(self._refused)
 
-    def metered(self, resource: str, make: Callable[[], Answer]) -> Answer:
-        """Makes an answer, but only if it may go out.
+    def admit(self, resource: str) -> None:
+        """Lets an answer be made that may go out now; `count_sent` says of how many bytes.
 
         Raises:
             UplinkBusyError: it may not go out now; the message says how long to wait.
@@ -186,8 +186,9 @@ class Uplink:
                     f"{self._rate} bytes of evidence a second go out (`uplink.evidence_bytes_per_s`): ask again in "
                     f"{wait_s:.1f} s"
                 )
-        answer = make()
+
+    def count_sent(self, resource: str, count: int) -> None:
+        """Takes the bytes of an answer that goes out."""
         with self._lock:
-            self._bucket.level -= len(answer.payload)
-            self._sent[resource] += len(answer.payload)
-        return answer
+            self._bucket.level -= count
+            self._sent[resource] += count

@@ -257,7 +257,6 @@ class PairHistory:
         self.damage = "; ".join(damages) or None
         self._next = 1 + max((record.entry.sequence for record in self.entries()), default=-1)
 
-    @property
     def durable_heads(self) -> dict[str, str]:
         """The newest entry on the disk of each book that has one. The state file may remember these and nothing
         newer."""

@@ -117,7 +117,7 @@ class PairStore:
         self._checks = CheckLog(config.directory / f"checks-{rig.pair}.jsonl", config.checks)
         self.protect()
         disk_writer.register(self.history, self.incidents, self._checks, store)
-        disk_writer.on_replaced(lambda text: self.history.append(self._entry("chain", "rewritten", text)))
+        disk_writer.on_replaced(self._note_replaced)
         if self.damage is not None:
             self.history.append(self._entry("chain", self.damage.code, self.damage.text))
         if self.history.damage is not None:
@@ -281,7 +281,7 @@ class PairStore:
         age_s = self.age_s
         completed_ns = None if age_s is None else self._clock.wall_ns() - round(age_s * NS_PER_S)
         clocks = Clocks(completed_ns, self._completed_stamp_ns, self._since_ns)
-        heads, windows = (lambda: self.history.durable_heads), self._commissioned_from
+        heads, windows = self.history.durable_heads, self._commissioned_from
         self._store.update(self._rig, self.state, clocks, heads, windows)
         self._disk_writer.write(self.history, self.incidents, self._store)
 
@@ -305,6 +305,9 @@ class PairStore:
             self.update(passed, None, completed=False)
 
     # --- inside -----------------------------------------------------------------------------------------------------
+
+    def _note_replaced(self, text: str) -> None:
+        self.history.append(self._entry("chain", "rewritten", text))
 
     def _entry(self, kind: EntryKind, code: str, text: str, stamp_ns: int | None = None) -> replies.HistoryEntry:
         """An entry dated now; its place in the chain is filled in when it is appended."""
