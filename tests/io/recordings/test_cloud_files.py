@@ -189,6 +189,18 @@ def test_npz(tmp_path: Path) -> None:
         load_cloud(0, "lidar", path)
 
 
+@pytest.mark.parametrize(("ring", "expected"), [(2.0, [1, 2]), (np.inf, None), (np.nan, None), (0.5, None)])
+def test_numbers_of_rings_as_floats_are_whole_where_points_are_finite(
+    tmp_path: Path, ring: float, expected: list[int] | None
+) -> None:
+    path = tmp_path / "cloud.pcd"
+    rows = np.array([[1, 2, 3, 1], [4, 5, 6, ring], [np.nan, 0, 0, np.nan]], "<f4")
+    header = "FIELDS x y z ring\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 3\nHEIGHT 1\nPOINTS 3\nDATA binary\n"
+    path.write_bytes(b"VERSION .7\n" + header.encode() + rows.tobytes())
+    found = load_cloud(0, "lidar", path).ring
+    assert (None if found is None else found.tolist()) == expected
+
+
 def test_numpy_files_that_lie(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "cloud.npy"
     np.save(path, np.zeros((4, 3)))

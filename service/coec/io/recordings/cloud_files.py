@@ -133,13 +133,13 @@ def _frame(
     )
     if ring is not None and (ring.dtype.kind not in "iu" or int(ring.max()) > 0xFFFF or int(ring.min()) < 0):
         # Its name says that it holds rings; whether they are scan lines depends on the frame of the points.
-        ring = ring if _are_whole(ring) else None
+        ring = ring if np.isfinite(ring[keep]).all() and _are_whole(ring[keep]) else None
     return LidarFrame(
         stamp_ns,
         frame_id,
         xyz_m[keep],
         intensity=None if intensity is None else intensity[keep].astype(np.float32),
-        ring=None if ring is None else np.nan_to_num(ring[keep]).astype(np.uint16),
+        ring=None if ring is None else ring[keep].astype(np.uint16),
         time_offset_s=None if time_offset_s is None else time_offset_s[keep],
         timed_by=timed_by,
         not_finite=int((~keep).sum()),

@@ -69,7 +69,7 @@ class Receiver(Protocol):
 
 
 class Vehicle:
-    """The engine of one vehicle. `sensor`, `sensors_of`, `join` and `listen` are for the main thread, `post_outcome`,
+    """The engine of one vehicle. `sensor`, `sensors_of`, `join` and `new_streams` are for the main thread, `post_outcome`,
     `inbox` and `arrivals` for any, `turn` and `finish` for `thread`, or for a caller without threads.
 
     Attributes:
