@@ -287,6 +287,15 @@ def test_a_restart_gives_the_same_bytes(rng: np.random.Generator) -> None:
     assert through.T_camera_lidar.tobytes() == restarted.T_camera_lidar.tobytes()
 
 
+def test_a_track_of_an_older_version_has_no_lag(rng: np.random.Generator) -> None:
+    track = after(track_at(TRUTH), samples(rng, 5), TrackerConfig())
+    document = json.loads(json.dumps(STATE_FORM.unstructure(track)))
+    assert any(document.pop("lag"))
+    read = structured(STATE_FORM, document, Track)
+    assert not read.lag.any()
+    assert read.T_camera_lidar.tobytes() == track.T_camera_lidar.tobytes()
+
+
 @pytest.mark.parametrize("broken", ["slow", "stamp_ns", "step", "prior_sigma"])
 def test_a_broken_document_is_refused(broken: str) -> None:
     document = STATE_FORM.unstructure(track_at(TRUTH))
@@ -307,7 +316,42 @@ def test_a_track_starts_at_a_rigid_pose_with_a_spread(pose: Array, sigma: Array)
 
 
 # ------------------------------------------------------------------------------------------------------- a drift
-def test_a_drift_is_followed_while_the_monitor_doubts_and_averaged_away_otherwise() -> None:
+def in_scenes(rng: np.random.Generator, count: int, rate_deg: float) -> list[tuple[Array, Measurement]]:
+    """Truths and windows of a mount that drifts by so much from one window to the next. The scene, another one every
+    five windows, shifts all three axes by some hundredths of a degree."""
+    made = []
+    for k in range(count):
+        if k % 5 == 0:
+            scene = rng.normal(0.0, radians(0.04), 3)
+        truth = se3.perturb(TRUTH, k * yaw(rate_deg))
+        shift = np.append(scene + rng.normal(0.0, radians(0.03), 3), np.zeros(3))
+        noise = np.diag([radians(0.03) ** 2] * 3 + [np.nan] * 3)
+        systematic = {f"scene_{axis}": radians(0.09) * np.eye(6)[axis] for axis in range(3)}
+        window = Measurement(se3.perturb(truth, shift), Uncertainty(noise, systematic, np.nan), k * PERIOD_NS)
+        made.append((truth, window))
+    return made
+
+
+def off_deg(rng: np.random.Generator, rate_deg: float) -> list[float]:
+    track, off = track_at(TRUTH), []
+    for truth, window in in_scenes(rng, 60, rate_deg):
+        track = update_track(track, window, TrackerConfig())
+        off.append(degrees(se3.rotation_angle_rad(track.T_camera_lidar @ se3.inverse(truth))))
+    return off
+
+
+@pytest.mark.parametrize(("rate_deg", "at_most_deg"), [(0.027, 0.3), (0.05, 0.3), (0.15, 0.6)])
+def test_a_drift_is_followed_even_if_no_window_by_itself_is_improbable(
+    rng: np.random.Generator, rate_deg: float, at_most_deg: float
+) -> None:
+    assert max(max(off_deg(rng, rate_deg)[1:]) for _ in range(10)) <= at_most_deg
+
+
+def test_scenes_that_shift_windows_as_little_as_they_say_are_averaged(rng: np.random.Generator) -> None:
+    assert np.sqrt(np.mean(np.square([off_deg(rng, 0.0)[20:] for _ in range(10)]))) <= 0.04
+
+
+def test_a_window_that_is_improbable_counts_for_more_while_the_monitor_doubts() -> None:
     settled = after(track_at(TRUTH), [about(TRUTH, np.zeros(6), SIGMA, k * PERIOD_NS) for k in range(5)])
     offset = about(TRUTH, yaw(0.18), SIGMA, 5 * PERIOD_NS)
     assert update_track(settled, offset, STILL).step is StepState.NONE

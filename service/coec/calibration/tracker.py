@@ -5,9 +5,11 @@ The slow track is an information filter on SE(3). Its state is a pose and the co
 that perturbation. Between windows the covariance grows with time, so that the track follows a mount that creeps. Errors
 that windows have in common do not average away: they are carried beside the noise and reported with it.
 
-A window that is improbable, but no step, while the monitor doubts what is served, comes from a mount that drifts faster
-than configured: the covariance of the slow track grows until it explains the window (adaptive fading: Xia, Rao, Ying,
-Shen 1994), so that the track follows a drift instead of averaging it away.
+A mount may drift faster than configured. Then each window is somewhat ahead of the slow track, always to the same side,
+though no single one is improbable. An exponentially weighted mean of the innovations (EWMA control chart: Roberts 1959)
+tells such a lag from noise. If the lag is improbable, or if a window is while the monitor doubts what is served, the
+covariance of the slow track grows until its noise explains the distance (adaptive fading: Xia, Rao, Ying, Shen 1994),
+so that the track follows a drift instead of averaging it away.
 
 Each window is first tested for whether it can come from the same mount: the squared Mahalanobis distance of its
 innovation is chi-square distributed if it does (Bar-Shalom, Li, Kirubarajan 2001, section 5.4). A window that fails the
@@ -20,8 +22,9 @@ All arithmetic is in plain floats (`linear`), so that the track survives restart
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import partial
 from math import erfc, exp, fsum, pi, radians, sqrt
 
 import numpy as np
@@ -40,9 +43,13 @@ NS_PER_H = 3_600_000_000_000
 IMPROBABLE = 0.01
 """Chance of a window below which it does not vouch for what is served."""
 
+LAG_WEIGHT, LAGGING = 0.25, 0.001
+"""Weight of the last window in the mean of the innovations, so that about seven windows count; and the chance of such a
+mean below which the mount drifts faster than configured. See docs/measured.md."""
+
 DOUBTFUL, EXPLAINED = 0.1, 0.5
-"""Chance of a window below which the mount drifts faster than configured, if the monitor doubts what is served, and the
-chance that the window has once the covariance has grown."""
+"""The chance of a single window, if the monitor doubts what is served; and the chance that the distance has once the
+covariance has grown."""
 
 GROWTH = 1.5
 """Factor by which the covariance grows at a time."""
@@ -121,6 +128,7 @@ class Track:
         candidate: the fast track while a step is suspected.
         innovation: squared Mahalanobis distance of the last window from the slow track; 0 before the first.
         chance: how probable a distance at least as large is without a step; 1 before the first window.
+        lag: (6,) how far the last windows were from the slow track on average, exponentially weighted.
     """
 
     slow: PosePosterior
@@ -130,6 +138,7 @@ class Track:
     candidate: PosePosterior | None = None
     innovation: float = 0.0
     chance: float = 1.0
+    lag: NDArray[np.float64] = field(default_factory=partial(np.zeros, 6))
 
     @classmethod
     def initial(cls, T_camera_lidar: Matrix4, prior_sigma: NDArray[np.float64], stamp_ns: int = 0) -> Track:
@@ -190,20 +199,29 @@ def update_track(track: Track, measurement: Measurement, config: TrackerConfig, 
         return track
     elapsed_h = max(0, measurement.stamp_ns - track.stamp_ns) / NS_PER_H
     slow = _drifted(track.slow, elapsed_h, config)
-    distance, chance = _disagreement(slow, measurement, axes)
+    away = se3.difference(measurement.T_camera_lidar, slow.T_camera_lidar)
+    distance, chance = _disagreement(away, slow.covariance + measurement.uncertainty.covariance, axes)
     stamp_ns = max(track.stamp_ns, measurement.stamp_ns)
-    updated = replace(track, stamp_ns=stamp_ns, slow=slow, innovation=distance, chance=chance)
+    still = np.zeros(6)
+    updated = replace(track, stamp_ns=stamp_ns, slow=slow, innovation=distance, chance=chance, lag=still)
     if chance >= config.step_false_alarm:
-        if doubted and chance < DOUBTFUL:
-            slow = _grown(slow, measurement, axes)
-        return replace(updated, slow=_updated(slow, measurement, axes), step=StepState.NONE, candidate=None)
+        lag = np.where(np.isin(np.arange(6), axes), track.lag + LAG_WEIGHT * (away - track.lag), track.lag)
+        if _is_improbable(lag, slow, measurement, axes):
+            slow, lag = _grown(slow, lag, measurement, axes), still
+        elif doubted and chance < DOUBTFUL:
+            slow, lag = _grown(slow, away, measurement, axes), still
+        slow = _updated(slow, measurement, axes)
+        return replace(updated, slow=slow, step=StepState.NONE, candidate=None, lag=lag)
     alone = _restarted(track, measurement, axes)
     if chance < config.overwhelming_false_alarm:
         return replace(updated, slow=alone, step=StepState.CONFIRMED, candidate=None)
     if track.candidate is not None:
         fast = _drifted(track.candidate, elapsed_h, config)
-        _, chance_of_fast = _disagreement(fast, measurement, axes)
-        if chance_of_fast >= config.step_false_alarm:
+        ahead = se3.difference(measurement.T_camera_lidar, fast.T_camera_lidar)
+        if (
+            _disagreement(ahead, fast.covariance + measurement.uncertainty.covariance, axes)[1]
+            >= config.step_false_alarm
+        ):
             return replace(updated, slow=_updated(fast, measurement, axes), step=StepState.CONFIRMED, candidate=None)
     return replace(updated, step=StepState.SUSPECTED, candidate=alone)
 
@@ -213,8 +231,8 @@ def fits(T_camera_lidar: Matrix4, measurement: Measurement) -> bool:
     axes = measurement.determined_axes()
     if not axes:
         return True
-    exact = PosePosterior(T_camera_lidar, np.zeros((6, 6)), {}, np.zeros(6, np.bool_), 0)
-    return _disagreement(exact, measurement, axes)[1] >= IMPROBABLE
+    away = se3.difference(measurement.T_camera_lidar, T_camera_lidar)
+    return _disagreement(away, measurement.uncertainty.covariance, axes)[1] >= IMPROBABLE
 
 
 def _restarted(track: Track, measurement: Measurement, axes: list[int]) -> PosePosterior:
@@ -234,22 +252,28 @@ def _drifted(posterior: PosePosterior, elapsed_h: float, config: TrackerConfig) 
     return replace(posterior, covariance=posterior.covariance + np.diag(elapsed_h * creep_sigma(config) ** 2))
 
 
-def _grown(slow: PosePosterior, measurement: Measurement, axes: list[int]) -> PosePosterior:
-    """The slow track with a covariance that explains a window."""
-    grown = slow
-    # Ends: the distance of the window falls to nothing as the covariance grows.
-    while _disagreement(grown, measurement, axes)[1] < EXPLAINED:
-        grown = replace(grown, covariance=GROWTH * grown.covariance)
-    return grown
+def _is_improbable(lag: NDArray[np.float64], slow: PosePosterior, measurement: Measurement, axes: list[int]) -> bool:
+    """Whether the mean of the innovations is one that a mount at rest hardly gives: if they are independent, it has
+    w / (2 - w) of their variance."""
+    spread = LAG_WEIGHT / (2.0 - LAG_WEIGHT) * (slow.covariance + measurement.uncertainty.covariance)
+    return _disagreement(lag, spread, axes)[1] < LAGGING
 
 
-def _disagreement(posterior: PosePosterior, measurement: Measurement, axes: list[int]) -> tuple[float, float]:
-    """Squared Mahalanobis distance of a window on the axes it determines, and the chance of one as large. Errors that
-    windows of one scene have in common differ between scenes, so the window's systematic errors count as noise here."""
-    away = se3.difference(measurement.T_camera_lidar, posterior.T_camera_lidar).tolist()
-    spread = (posterior.covariance + measurement.uncertainty.covariance).tolist()
-    s = [[spread[i][j] for j in axes] for i in axes]
-    y = [away[i] for i in axes]
+def _grown(slow: PosePosterior, away: NDArray[np.float64], measurement: Measurement, axes: list[int]) -> PosePosterior:
+    """The slow track with a covariance that explains a distance (6,) by the noise of a window: the next update then
+    goes most of that way."""
+    covariance = slow.covariance
+    # Ends: the distance falls to nothing as the covariance grows.
+    while _disagreement(away, covariance + measurement.uncertainty.noise, axes)[1] < EXPLAINED:
+        covariance = GROWTH * covariance
+    return replace(slow, covariance=covariance)
+
+
+def _disagreement(away: NDArray[np.float64], covariance: Matrix6, axes: list[int]) -> tuple[float, float]:
+    """Squared Mahalanobis distance of a difference (6,) on some axes, and the chance of one as large. Errors that
+    windows of one scene have in common differ between scenes, so systematic errors of a window count as noise in
+    `covariance` (6, 6)."""
+    s, y = covariance[np.ix_(axes, axes)].tolist(), away[axes].tolist()
     distance = fsum(a * b for a, b in zip(y, solved(s, y), strict=True))
     return distance, chi_square_tail(distance, len(axes))
 

@@ -197,8 +197,8 @@ def test_numbers_of_rings_as_floats_are_whole_where_points_are_finite(
     rows = np.array([[1, 2, 3, 1], [4, 5, 6, ring], [np.nan, 0, 0, np.nan]], "<f4")
     header = "FIELDS x y z ring\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 3\nHEIGHT 1\nPOINTS 3\nDATA binary\n"
     path.write_bytes(b"VERSION .7\n" + header.encode() + rows.tobytes())
-    found = load_cloud(0, "lidar", path).ring
-    assert (None if found is None else found.tolist()) == expected
+    read = load_cloud(0, "lidar", path).ring
+    assert (None if read is None else read.tolist()) == expected
 
 
 def test_numpy_files_that_lie(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

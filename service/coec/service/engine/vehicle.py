@@ -69,8 +69,8 @@ class Receiver(Protocol):
 
 
 class Vehicle:
-    """The engine of one vehicle. `sensor`, `sensors_of`, `join` and `new_streams` are for the main thread, `post_outcome`,
-    `inbox` and `arrivals` for any, `turn` and `finish` for `thread`, or for a caller without threads.
+    """The engine of one vehicle. `sensor`, `sensors_of`, `join` and `new_streams` are for the main thread,
+    `post_outcome`, `inbox` and `arrivals` for any, `turn` and `finish` for `thread`, or for a caller without threads.
 
     Attributes:
         waiting_frames: frames of the pairs that have come and wait to be evaluated.

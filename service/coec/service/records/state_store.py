@@ -207,7 +207,14 @@ def _state_form() -> Converter:
         systematic=converter.arrays(6),
         observed=observed,
     )
-    converter.register(form, Track, required=[one.name for one in fields(Track)], prior_sigma=converter.array(6))
+    # The first versions knew no lag.
+    converter.register(
+        form,
+        Track,
+        required=[one.name for one in fields(Track) if one.name != "lag"],
+        prior_sigma=converter.array(6),
+        lag=converter.array(6),
+    )
     count = converter.bounded(converter.whole_number, lambda value: value >= 0, "a count")
     converter.register(form, AlarmRecord, watched_ns=count, confirmed=count, withdrawn=count)
     # Nanoseconds since 1970, as the clocks of Linux count them.
