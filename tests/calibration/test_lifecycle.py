@@ -258,6 +258,18 @@ def test_the_monitor_reports_since_when_a_window_is_requested() -> None:
     assert urgent_window_since(state) == state.flagged_since_ns
 
 
+def test_faint_checks_that_add_up_to_no_move_make_the_pair_degraded_and_a_window_urgent() -> None:
+    """As in a tunnel, where edges fit elsewhere by chance: the checks accuse the mount, and none acquits it."""
+    offsets = ([0.02, 0.0, 0.0, 0.0, 0.0, 0.0], [-0.02, 0.0, 0.0, 0.0, 0.0, 0.0])
+    accuse = [
+        replace(check(205 + 5 * k, flagged=True), offset=np.array(offset), weak=True)
+        for k, offset in enumerate(offsets)
+    ]
+    state = watched(HEALTHY, check(195), replace(check(200), has_power=False), *accuse)
+    assert (state.health, [reason.code for reason in state.reasons]) == (HealthState.DEGRADED, ["not_acquitted"])
+    assert urgent_window_since(state) == state.flagged_since_ns is not None
+
+
 def test_one_poor_stretch_after_another_is_one() -> None:
     poor = MonitorState(outcome=MonitorOutcome.CLEAR, blind={"open_field": 3.0})
     state = watched(replace(HEALTHY, monitor=poor), *clear_from(300, 1))

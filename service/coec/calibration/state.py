@@ -296,13 +296,14 @@ def _unambiguous_move(estimate: Estimate) -> MovedWithin | None:
 def urgent_window_since(state: PairState) -> int | None:
     """The sensor time since which pairs are wanted for an urgent window; None if none is urgent. It is urgent if the
     monitor accuses the served extrinsic; if the camera moved within the latest window and health is `suspect` or
-    `miscalibrated`; or if checks have made health `suspect`."""
+    `miscalibrated`; or if checks have made health `suspect`, or contradict the extrinsic and none confirms it."""
     if state.monitor.outcome in ACCUSING and state.flagged_since_ns is not None:
         return state.flagged_since_ns
     moved = None if state.latest is None else _unambiguous_move(state.latest)
     if moved is not None and state.seen in (HealthState.SUSPECT, HealthState.MISCALIBRATED):
         return moved.first_after_ns
-    return state.flagged_since_ns if state.seen is HealthState.SUSPECT else None
+    unconfirmed = state.seen is HealthState.SUSPECT or any(reason.code == NOT_ACQUITTED for reason in state.reasons)
+    return state.flagged_since_ns if unconfirmed else None
 
 
 def carried_over_pairs(estimate: Estimate) -> CarriedOverPairs | None:
@@ -476,11 +477,13 @@ def _not_renewed(state: PairState, observation: Observation, rules: PairRules) -
     # What explains less than a whole check, or of the mount no more than one, explains nothing of the others.
     least = {BENT_MOUNT: BLIND_AT}
     cause = leading_cause({code: weight for code, weight in monitor.blind.items() if weight >= least.get(code, 1.0)})
-    if cause is not None and cause.code == BENT_MOUNT:
+    accused = cause is not None and cause.code == BENT_MOUNT
+    # Where edges are faint, as in a tunnel, single checks find them elsewhere by chance: that adds up to no move.
+    if accused and monitor.evidence >= rules.alarm.clear:
         text = "The latest checks contradict the extrinsic, and none confirms it."
         return _poor(state, HealthEvent.SUSPECTED, observation.stamp_ns, Reason("monitor_suspects", text))
     text = "No check of the latest pairs can confirm the extrinsic: their edges are faint, or do not fit well enough."
-    why = Reason(NOT_ACQUITTED, text) if cause is None else cause.as_reason()
+    why = Reason(NOT_ACQUITTED, text) if cause is None or accused else cause.as_reason()
     return _poor(state, HealthEvent.NOT_ACQUITTED, observation.stamp_ns, why)
 
 

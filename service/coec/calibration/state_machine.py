@@ -78,8 +78,8 @@ MEANING: Mapping[HealthEvent, str] = MappingProxyType(
         "served one",
         HealthEvent.CLEAR: "a check validates an extrinsic that a window has confirmed",
         HealthEvent.NO_OBJECTION: "a check validates an extrinsic that no window has confirmed",
-        HealthEvent.SUSPECTED: "the monitor suspects that the mount has moved, or checks contradict the extrinsic and "
-        "none validates it for three periods",
+        HealthEvent.SUSPECTED: "the monitor suspects that the mount has moved, or checks that agree on a move "
+        "contradict the extrinsic and none validates it for three periods",
         HealthEvent.MOUNT_MOVED: "the monitor confirms that the mount has moved",
         HealthEvent.AT_ODDS: "checks contradict the extrinsic, but do not agree on a move",
         HealthEvent.DATA_CAUSE: "the data cannot be judged: lens, light, LiDAR, ego-motion, time",
