@@ -332,6 +332,23 @@ def in_scenes(rng: np.random.Generator, count: int, rate_deg: float) -> list[tup
     return made
 
 
+def test_a_drift_leaves_what_is_known_of_axes_that_no_window_determines(rng: np.random.Generator) -> None:
+    windows = [window for _, window in in_scenes(rng, 60, 0.05)]
+    still = after(track_at(TRUTH), windows[:1])
+    drifting = after(track_at(TRUTH), windows)
+    assert drifting.windows == 60, "it never was a step"
+    np.testing.assert_allclose(drifting.covariance[3:, 3:], still.covariance[3:, 3:], rtol=1e-9)
+
+
+def test_an_outlier_does_not_hide_a_lag(rng: np.random.Generator) -> None:
+    windows = [window for _, window in in_scenes(rng, 20, 0.01)]
+    before = after(track_at(TRUTH), windows[:-1], TrackerConfig())
+    outlier = replace(windows[-1], T_camera_lidar=se3.perturb(TRUTH, yaw(5.0)))
+    suspected = update_track(before, outlier, TrackerConfig())
+    assert suspected.step is StepState.SUSPECTED
+    np.testing.assert_array_equal(suspected.lag, before.lag)
+
+
 def off_deg(rng: np.random.Generator, rate_deg: float) -> list[float]:
     track, off = track_at(TRUTH), []
     for truth, window in in_scenes(rng, 60, rate_deg):

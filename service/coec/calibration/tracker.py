@@ -203,7 +203,7 @@ def update_track(track: Track, measurement: Measurement, config: TrackerConfig, 
     distance, chance = _disagreement(away, slow.covariance + measurement.uncertainty.covariance, axes)
     stamp_ns = max(track.stamp_ns, measurement.stamp_ns)
     still = np.zeros(6)
-    updated = replace(track, stamp_ns=stamp_ns, slow=slow, innovation=distance, chance=chance, lag=still)
+    updated = replace(track, stamp_ns=stamp_ns, slow=slow, innovation=distance, chance=chance)
     if chance >= config.step_false_alarm:
         lag = np.where(np.isin(np.arange(6), axes), track.lag + LAG_WEIGHT * (away - track.lag), track.lag)
         if _is_improbable(lag, slow, measurement, axes):
@@ -214,15 +214,14 @@ def update_track(track: Track, measurement: Measurement, config: TrackerConfig, 
         return replace(updated, slow=slow, step=StepState.NONE, candidate=None, lag=lag)
     alone = _restarted(track, measurement, axes)
     if chance < config.overwhelming_false_alarm:
-        return replace(updated, slow=alone, step=StepState.CONFIRMED, candidate=None)
+        return replace(updated, slow=alone, step=StepState.CONFIRMED, candidate=None, lag=still)
     if track.candidate is not None:
         fast = _drifted(track.candidate, elapsed_h, config)
         ahead = se3.difference(measurement.T_camera_lidar, fast.T_camera_lidar)
-        if (
-            _disagreement(ahead, fast.covariance + measurement.uncertainty.covariance, axes)[1]
-            >= config.step_false_alarm
-        ):
-            return replace(updated, slow=_updated(fast, measurement, axes), step=StepState.CONFIRMED, candidate=None)
+        _, chance_of_fast = _disagreement(ahead, fast.covariance + measurement.uncertainty.covariance, axes)
+        if chance_of_fast >= config.step_false_alarm:
+            slow = _updated(fast, measurement, axes)
+            return replace(updated, slow=slow, step=StepState.CONFIRMED, candidate=None, lag=still)
     return replace(updated, step=StepState.SUSPECTED, candidate=alone)
 
 
@@ -261,11 +260,12 @@ def _is_improbable(lag: NDArray[np.float64], slow: PosePosterior, measurement: M
 
 def _grown(slow: PosePosterior, away: NDArray[np.float64], measurement: Measurement, axes: list[int]) -> PosePosterior:
     """The slow track with a covariance that explains a distance (6,) by the noise of a window: the next update then
-    goes most of that way."""
+    goes most of that way. On axes that the window does not determine the covariance stays."""
     covariance = slow.covariance
+    scale = np.where(np.isin(np.arange(6), axes), sqrt(GROWTH), 1.0)
     # Ends: the distance falls to nothing as the covariance grows.
     while _disagreement(away, covariance + measurement.uncertainty.noise, axes)[1] < EXPLAINED:
-        covariance = GROWTH * covariance
+        covariance = scale[:, None] * covariance * scale
     return replace(slow, covariance=covariance)
 
 
