@@ -48,8 +48,8 @@ LAG_WEIGHT, LAGGING = 0.25, 0.001
 mean below which the mount drifts faster than configured. See docs/measured.md."""
 
 DOUBTFUL, EXPLAINED = 0.1, 0.5
-"""The chance of a single window, if the monitor doubts what is served; and the chance that the distance has once the
-covariance has grown."""
+"""Chance of a single window below which the mount drifts faster than configured, if the monitor doubts what is served;
+and the chance that the distance has once the covariance has grown."""
 
 GROWTH = 1.5
 """Factor by which the covariance grows at a time."""
