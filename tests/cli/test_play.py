@@ -283,3 +283,7 @@ def test_a_drive_of_several_lidars_is_replayed_with_the_topics_of_the_configured
     )
     reported = coec("replay", bag, "--config", configuration, "--from", 1000)
     assert "no camera frame lies between --from and --until: two.mcap/front/image is shorter" in reported.err
+    reported = coec("replay", bag, "--from", 5, "--until", 1)
+    assert (reported.status, "--until 1 is not later than --from 5" in reported.err) == (2, True)
+    reported = coec("replay", bag, "--config", configuration, "--against", configuration)
+    assert "coec.yaml is no log of decisions" in reported.err

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from coec.config import Config, PairConfig
     from coec.io.recordings.recording_source import RecordingSource
     from coec.schemas.rig_state import RigReply
-    from coec.service.decision_log import Difference, ReplayedDrive
+    from coec.service.decision_log import Decision, Difference, ReplayedDrive
 
 NS_PER_S = 1_000_000_000
 
@@ -77,7 +77,7 @@ def replay(
     other recording goes through the engine of the service, faster than real time and without losing a frame; its
     decisions are listed, and compared with those of another version or of a vehicle.
     """
-    from coec.service.decision_log import write_log, write_replay_page
+    from coec.service.decision_log import read_log, write_log, write_replay_page
 
     window = Path(source)
     options = {
@@ -95,10 +95,15 @@ def replay(
         if given:
             raise UsageError(f"{window} is a window; {', '.join(given)} applies to the replay of a drive")
         return _replay_window(window, depth, as_json=as_json)
+    if until_s is not None and until_s <= begin_s:
+        raise UsageError(
+            f"--until {until_s:g} is not later than --from {begin_s:g}: both count from the begin of the drive"
+        )
     recordings, configuration = _opened(source, config, pair, depth)
+    expected = {} if against is None else {name: read_log(against, name) for name in recordings}
     drives, rig = _replay_drive(recordings, configuration, begin_s, until_s)
     first_ns = min(recording.camera_stamps_ns[0] for recording in recordings.values())
-    differing = {} if against is None else {name: _compared(against, name, drive) for name, drive in drives.items()}
+    differing = {name: _compared(expected[name], drives[name]) for name in expected}
     if log is not None:
         write_log(log, {name: drive.decisions for name, drive in drives.items()})
     if report is not None:
@@ -292,10 +297,10 @@ def _replay_drive(
         return drives, reply_of(config.vehicle, drive.rig)
 
 
-def _compared(against: Path, pair: str, drive: ReplayedDrive) -> tuple[Difference, ...]:
-    from coec.service.decision_log import differences, read_log
+def _compared(expected: Sequence[Decision], drive: ReplayedDrive) -> tuple[Difference, ...]:
+    from coec.service.decision_log import differences
 
-    there = [one for one in read_log(against, pair) if drive.begin_ns <= one.stamp_ns <= drive.end_ns]
+    there = [one for one in expected if drive.begin_ns <= one.stamp_ns <= drive.end_ns]
     return differences(there, drive.decisions)
 
 
