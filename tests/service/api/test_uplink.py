@@ -4,10 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
+from typing import cast
+from unittest.mock import Mock
 
 import pytest
 
 from coec.config import UplinkConfig
+from coec.io.zenoh.bus import Request
+from coec.schemas.keys import Keys
+from coec.service.api.reply_builders import SerializedReply
+from coec.service.api.routes import VehicleReplies, VehicleRoutes
 from coec.service.api.uplink import BURST_BYTES, Uplink, UplinkBusyError
 
 RATE = 100_000
@@ -41,6 +47,22 @@ def test_nothing_is_admitted_while_more_went_out_than_the_rate_allows() -> None:
     with pytest.raises(UplinkBusyError, match=r"ask again in 1\.0 s"):
         uplink.admit("overlay")
     assert uplink.refused == {"overlay": 1}
+
+
+@pytest.mark.parametrize("resource", ["history", "overlay", "windows/front-1", "evidence/front-1"])
+def test_nothing_is_read_that_may_not_go_out(resource: str) -> None:
+    uplink = Uplink(UplinkConfig(evidence_bytes_per_s=RATE), lambda: 0.0)
+    uplink.count_sent("windows", BURST_BYTES + RATE)
+    keys, bus, pair, unasked = Keys("coec", "test"), Mock(), Mock(), SerializedReply(b"", b"")
+    pair.name = "front"
+    VehicleRoutes(
+        keys, {"front": pair}, Mock(), VehicleReplies(unasked, unasked), lambda: b"", Mock(), Mock(), uplink
+    ).declare(bus)
+    finders = {call.args[0]: call.args[1] for call in bus.serve.call_args_list}
+    (route,) = finders[f"{keys.root}/front/**"](f"{keys.root}/front/{resource}")
+    with pytest.raises(UplinkBusyError, match=r"ask again in 1\.0 s"):
+        route.answer(cast("Request", Mock(parameters="", received_s=0.0)))
+    assert pair.mock_calls == []
 
 
 def test_a_new_rate_holds_at_once_and_gives_nothing_for_the_time_before() -> None:
