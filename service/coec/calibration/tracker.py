@@ -199,13 +199,12 @@ def update_track(track: Track, measurement: Measurement, config: TrackerConfig, 
         return track
     elapsed_h = max(0, measurement.stamp_ns - track.stamp_ns) / NS_PER_H
     slow = _drifted(track.slow, elapsed_h, config)
-    away = se3.difference(measurement.T_camera_lidar, slow.T_camera_lidar)
-    distance, chance = _disagreement(away, slow.covariance + measurement.uncertainty.covariance, axes)
+    away, distance, chance = _innovation(slow, measurement, axes)
     stamp_ns = max(track.stamp_ns, measurement.stamp_ns)
     still = np.zeros(6)
     updated = replace(track, stamp_ns=stamp_ns, slow=slow, innovation=distance, chance=chance)
     if chance >= config.step_false_alarm:
-        lag = np.where(np.isin(np.arange(6), axes), track.lag + LAG_WEIGHT * (away - track.lag), track.lag)
+        lag = np.where(_determined(axes), track.lag + LAG_WEIGHT * (away - track.lag), track.lag)
         if _is_improbable(lag, slow, measurement, axes):
             slow, lag = _grown(slow, lag, measurement, axes), still
         elif doubted and chance < DOUBTFUL:
@@ -217,8 +216,7 @@ def update_track(track: Track, measurement: Measurement, config: TrackerConfig, 
         return replace(updated, slow=alone, step=StepState.CONFIRMED, candidate=None, lag=still)
     if track.candidate is not None:
         fast = _drifted(track.candidate, elapsed_h, config)
-        ahead = se3.difference(measurement.T_camera_lidar, fast.T_camera_lidar)
-        _, chance_of_fast = _disagreement(ahead, fast.covariance + measurement.uncertainty.covariance, axes)
+        _, _, chance_of_fast = _innovation(fast, measurement, axes)
         if chance_of_fast >= config.step_false_alarm:
             slow = _updated(fast, measurement, axes)
             return replace(updated, slow=slow, step=StepState.CONFIRMED, candidate=None, lag=still)
@@ -240,7 +238,7 @@ def _restarted(track: Track, measurement: Measurement, axes: list[int]) -> PoseP
     away = se3.difference(measurement.T_camera_lidar, track.T_camera_lidar)
     covariance = np.diag(track.prior_sigma**2)
     covariance[np.ix_(axes, axes)] = measurement.uncertainty.noise[np.ix_(axes, axes)]
-    determined = np.isin(np.arange(6), axes)
+    determined = _determined(axes)
     systematic = {name: np.where(determined, shift, 0.0) for name, shift in measurement.uncertainty.systematic.items()}
     pose = se3.perturb(track.T_camera_lidar, np.where(determined, away, 0.0))
     return PosePosterior(pose, covariance, systematic, determined, 1)
@@ -249,6 +247,19 @@ def _restarted(track: Track, measurement: Measurement, axes: list[int]) -> PoseP
 def _drifted(posterior: PosePosterior, elapsed_h: float, config: TrackerConfig) -> PosePosterior:
     """The belief after `elapsed_h` hours in which the mount may have crept."""
     return replace(posterior, covariance=posterior.covariance + np.diag(elapsed_h * creep_sigma(config) ** 2))
+
+
+def _determined(axes: list[int]) -> NDArray[np.bool_]:
+    """(6,) whether an axis is among these."""
+    return np.isin(np.arange(6), axes)
+
+
+def _innovation(
+    posterior: PosePosterior, measurement: Measurement, axes: list[int]
+) -> tuple[NDArray[np.float64], float, float]:
+    """(6,) from a belief to a window, its squared Mahalanobis distance on some axes, and the chance of one as large."""
+    away = se3.difference(measurement.T_camera_lidar, posterior.T_camera_lidar)
+    return away, *_disagreement(away, posterior.covariance + measurement.uncertainty.covariance, axes)
 
 
 def _is_improbable(lag: NDArray[np.float64], slow: PosePosterior, measurement: Measurement, axes: list[int]) -> bool:
@@ -262,7 +273,7 @@ def _grown(slow: PosePosterior, away: NDArray[np.float64], measurement: Measurem
     """The slow track with a covariance that explains a distance (6,) by the noise of a window: the next update then
     goes most of that way. On axes that the window does not determine the covariance stays."""
     covariance = slow.covariance
-    scale = np.where(np.isin(np.arange(6), axes), sqrt(GROWTH), 1.0)
+    scale = np.where(_determined(axes), sqrt(GROWTH), 1.0)
     # Ends: the distance falls to nothing as the covariance grows.
     while _disagreement(away, covariance + measurement.uncertainty.noise, axes)[1] < EXPLAINED:
         covariance = scale[:, None] * covariance * scale
@@ -308,7 +319,7 @@ def _updated(posterior: PosePosterior, measurement: Measurement, axes: list[int]
         se3.perturb(posterior.T_camera_lidar, xi),
         0.5 * (covariance + covariance.T),
         systematic,
-        posterior.observed | np.isin(np.arange(6), axes),
+        posterior.observed | _determined(axes),
         posterior.windows + 1,
     )
 
