@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.rig import edge_observations, rig_estimator
+from coec.calibration.rig import edge_observations, nearest_neighbours, rig_estimator
 from coec.calibration.rig.attribution import RigState, SensorHealth, after_edge_observation, initial
 from coec.calibration.rig.edge_observations import EdgeObservation
 from coec.calibration.rig.graph import Edge, RigGraph, RigidLink, Sensor, SensorKind
@@ -26,7 +26,6 @@ from coec.calibration.tracker import Measurement
 from coec.calibration.types import EgoMotion, Frame, LidarFrame, Matrix4, Reason, Uncertainty
 from coec.config import BudgetConfig, LidarEdgesConfig, LimitsConfig, PairConfig
 from coec.geometry import se3
-from coec.io import nearest_neighbours
 from coec.io.converter import structured
 from coec.io.disk_writer import DiskWriter
 from coec.schemas.rig_state import LidarsReply, RigReply

@@ -1,4 +1,4 @@
-"""Surroundings of a LiDAR, its sweeps of them, and a search of neighbours that is an oracle."""
+"""Surroundings of a LiDAR, and its sweeps of them."""
 
 from __future__ import annotations
 
@@ -13,28 +13,6 @@ from coec.geometry import se3
 Doubles = NDArray[np.float64]
 
 NOISE_M = 0.02
-
-
-class BruteForce:
-    """Every distance, as slow as it is plain."""
-
-    def __init__(self, points_m: Doubles) -> None:
-        self._points_m = points_m
-
-    def nearest(self, queries_m: Doubles, count: int) -> tuple[NDArray[np.int64], Doubles]:
-        points = self._points_m
-        separation = (queries_m**2).sum(axis=1)[:, None] + (points**2).sum(axis=1) - 2.0 * queries_m @ points.T
-        detected = np.argpartition(separation, count - 1, axis=1)[:, :count]
-        squared = np.take_along_axis(separation, detected, axis=1)
-        order = np.argsort(squared, axis=1, kind="stable")
-        return np.take_along_axis(detected, order, axis=1), np.take_along_axis(squared, order, axis=1)
-
-
-class BruteForceSearch:
-    """A `NeighbourSearch`."""
-
-    def over(self, points_m: Doubles) -> BruteForce:
-        return BruteForce(points_m)
 
 
 Shape = Callable[[np.random.Generator, int], Doubles]

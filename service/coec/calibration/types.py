@@ -683,18 +683,3 @@ def run_to_end(steps: Steps[T], progress: Progress) -> T:
             result: T = end.value
             return result
         progress.step(step.stage, step.done, step.total)
-
-
-class Neighbourhood(Protocol):
-    """A set of points in which the nearest ones can be looked up."""
-
-    def nearest(self, queries_m: NDArray[np.float64], count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Indices (N, count) of the nearest points of each query (N, 3), nearest first, and squared distances
-        (N, count) in m². The set must hold at least `count` points. Every call gives the same to the bit."""
-
-
-class NeighbourSearch(Protocol):
-    """Prepares points for looking up the nearest ones."""
-
-    def over(self, points_m: NDArray[np.float64]) -> Neighbourhood:
-        """The neighbourhood over finite points (M, 3)."""

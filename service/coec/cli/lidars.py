@@ -40,17 +40,15 @@ def lidars(
     """Find the pose of one LiDAR in another from the surfaces that both see: exit 1 if those are too few."""
     from coec.calibration.rig.lidar_registration import register
     from coec.geometry.se3 import difference
-    from coec.io.nearest_neighbours import Trees
     from coec.io.recordings.layouts import open_lidars
     from coec.io.serialise import in_degrees
 
-    search = Trees()
     recording = open_lidars(source, a, b)
     started_s = time.monotonic()
     with console.progress() as bars:
         bars.add_task(recording.name, total=None, note="sweeps")
         sweeps = recording.pairs(pairs)
-        edge = register(recording.rig, sweeps, search)
+        edge = register(recording.rig, sweeps)
     error = None
     if recording.truth is not None:
         error = in_degrees(difference(edge.T_a_b, recording.truth(sweeps[len(sweeps) // 2].a.stamp_ns)))

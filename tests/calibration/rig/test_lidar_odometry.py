@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from coec.calibration.frames.motion_compensation import sensor_twist
+from coec.calibration.rig import nearest_neighbours
 from coec.calibration.rig.lidar_odometry import motions_of_sweeps
 from coec.calibration.types import EgoMotion, LidarFrame
 from coec.geometry import se3
-from coec.io import nearest_neighbours
 from support.surroundings import Doubles, Shape, corridor, room, sweep
 
 pytestmark = pytest.mark.skipif(not nearest_neighbours.installed(), reason="the extra `lidars` is not installed")
@@ -48,7 +48,7 @@ def of_lidar(motion: EgoMotion) -> Doubles:
 def test_the_motion_between_two_sweeps_is_measured(speed_mps: float, turn_radps: float) -> None:
     """Velocities that carry the vehicle further than a registration leads are measured from one that is near."""
     moved = ego(speed_mps, turn_radps)
-    (measured,) = motions_of_sweeps([consecutive(room, moved)], None, nearest_neighbours.Trees())
+    (measured,) = motions_of_sweeps([consecutive(room, moved)], None)
     assert measured is not None
     assert measured.linear_mps is not None
     twist = np.array([*measured.angular_radps, *measured.linear_mps])
@@ -59,14 +59,14 @@ def test_the_motion_between_two_sweeps_is_measured(speed_mps: float, turn_radps:
 def test_a_velocity_is_followed_from_pair_to_pair() -> None:
     moved = ego(-18.0, 0.0)
     pairs = [consecutive(room, moved, seed=seed) for seed in (1, 2)]
-    for measured in motions_of_sweeps(pairs, None, nearest_neighbours.Trees()):
+    for measured in motions_of_sweeps(pairs, None):
         assert measured is not None
         assert measured.speed_mps == pytest.approx(18.0, abs=0.2)
 
 
 @pytest.mark.fault("odometry is missing, and the LiDAR drives along a corridor", "the velocity stays unknown")
 def test_along_a_corridor_the_turn_alone_is_known() -> None:
-    (measured,) = motions_of_sweeps([consecutive(corridor, ego(5.0, 0.2))], None, nearest_neighbours.Trees())
+    (measured,) = motions_of_sweeps([consecutive(corridor, ego(5.0, 0.2))], None)
     assert measured is not None
     assert measured.linear_mps is None
     np.testing.assert_allclose(measured.angular_radps, of_lidar(ego(5.0, 0.2))[:3], atol=np.deg2rad(3.0))
@@ -75,7 +75,7 @@ def test_along_a_corridor_the_turn_alone_is_known() -> None:
 def test_sweeps_that_are_not_consecutive_show_no_motion() -> None:
     same = consecutive(room, ego(1.0, 0.0))[0]
     pairs = [consecutive(room, ego(1.0, 0.0), turns=4.0), (same, same)]
-    assert list(motions_of_sweeps(pairs, None, nearest_neighbours.Trees())) == [None, None]
+    assert list(motions_of_sweeps(pairs, None)) == [None, None]
 
 
 def test_surroundings_that_do_not_fit_show_no_motion() -> None:
@@ -85,4 +85,4 @@ def test_surroundings_that_do_not_fit_show_no_motion() -> None:
     elsewhere = LidarFrame(
         10**8, "lidar", rng.uniform(-30.0, 30.0, (1500, 3)).astype(np.float32), time_offset_s=np.zeros(1500, np.float32)
     )
-    assert list(motions_of_sweeps([(here, elsewhere)], None, nearest_neighbours.Trees())) == [None]
+    assert list(motions_of_sweeps([(here, elsewhere)], None)) == [None]

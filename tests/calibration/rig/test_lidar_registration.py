@@ -12,7 +12,7 @@ from coec.calibration.rig.lidar_registration import register
 from coec.calibration.rig.lidar_sampling import LidarEdge, LidarRig, SweepPair
 from coec.calibration.types import EgoMotion, LidarFrame
 from coec.geometry import se3
-from support.surroundings import NOISE_M, BruteForceSearch, Shape, corridor, room, sweep
+from support.surroundings import NOISE_M, Shape, corridor, room, sweep
 
 Doubles = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ def drive(shape: Shape, seed: int, *, pairs: int = 3, longer_m: float = 0.0, cou
 
 def edge(pairs: list[SweepPair], off: Doubles) -> LidarEdge:
     """Registered from a nominal pose that is wrong by ξ `off` (6,)."""
-    return register(LidarRig("a", "b", se3.perturb(T_A_B, off), T_A_EGO), pairs, BruteForceSearch())
+    return register(LidarRig("a", "b", se3.perturb(T_A_B, off), T_A_EGO), pairs)
 
 
 def error(detected: LidarEdge) -> Doubles:
@@ -75,8 +75,8 @@ def test_moving_b_by_s_moves_its_pose_by_the_inverse() -> None:
         )
         for p in pairs
     ]
-    before = register(LidarRig("a", "b", T_A_B, T_A_EGO), pairs, BruteForceSearch())
-    after = register(LidarRig("a", "b", T_A_B @ se3.inverse(shift), T_A_EGO), moved, BruteForceSearch())
+    before = register(LidarRig("a", "b", T_A_B, T_A_EGO), pairs)
+    after = register(LidarRig("a", "b", T_A_B @ se3.inverse(shift), T_A_EGO), moved)
     # Another choice of points, one in every cube, is another draw of the noise.
     separation = se3.difference(after.T_a_b @ shift, before.T_a_b)
     assert np.rad2deg(np.abs(separation[:3])).max() < 0.1
@@ -89,9 +89,9 @@ def test_the_pose_of_a_in_b_is_the_inverse() -> None:
     b = sweep(room(rng, 2200), se3.inverse(T_A_B) @ T_A_EGO, "b", rng)
     off = np.array([0.0, 0.0, np.deg2rad(1.0), 0.0, 0.03, 0.0])
     start = se3.perturb(T_A_B, off)
-    there = register(LidarRig("a", "b", start, T_A_EGO), [SweepPair(a, b, None)], BruteForceSearch())
+    there = register(LidarRig("a", "b", start, T_A_EGO), [SweepPair(a, b, None)])
     T_b_ego = se3.inverse(T_A_B) @ T_A_EGO
-    back = register(LidarRig("b", "a", se3.inverse(start), T_b_ego), [SweepPair(b, a, None)], BruteForceSearch())
+    back = register(LidarRig("b", "a", se3.inverse(start), T_b_ego), [SweepPair(b, a, None)])
     separation = se3.difference(there.T_a_b, se3.inverse(back.T_a_b))
     # Points of the one on planes of the other, and the other way round: not the same draw of the noise.
     sigma = np.hypot(there.sigma, (np.abs(se3.adjoint(there.T_a_b)) @ back.sigma))

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from coec.calibration.frames.motion_compensation import compensation, sensor_twist
+from coec.calibration.rig import nearest_neighbours
 from coec.calibration.types import Compensation, LidarFrame
 from coec.errors import SourceError
-from coec.io import nearest_neighbours
 from coec.io.recordings.window_cutting import LoadedWindow, window_of_recording
 from support.simulated_drives import rendered_source
 

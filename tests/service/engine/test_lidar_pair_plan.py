@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from coec.calibration.rig import nearest_neighbours
 from coec.geometry import se3
-from coec.io import nearest_neighbours
 from coec.service.engine import lidar_pairs
 from coec.service.engine.lidar_pairs import plan_lidar_pairs
 from support.rigs import LIDAR_POSES, LIDARS, LidarBench, lidar_pair, with_extra

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from coec.calibration.rig.lidar_registration import register
 from coec.calibration.rig.lidar_sampling import LidarEdge, LidarRig, SweepPair
-from coec.calibration.types import EgoMotion, LidarFrame, NeighbourSearch, SweepTiming
+from coec.calibration.types import EgoMotion, LidarFrame, SweepTiming
 from coec.geometry import se3
 from coec.geometry.points import thinned
 
@@ -50,7 +50,7 @@ Twist = NDArray[np.float64]
 
 
 def motions_of_sweeps(
-    consecutive: Iterable[tuple[LidarFrame, LidarFrame]], timing: SweepTiming | None, search: NeighbourSearch
+    consecutive: Iterable[tuple[LidarFrame, LidarFrame]], timing: SweepTiming | None
 ) -> Iterator[EgoMotion | None]:
     """The motion of a LiDAR in its own frame over each of some pairs of consecutive sweeps, with the stamp of the
     earlier one; None where the surroundings do not determine it. The velocity is None where they determine the turn
@@ -59,14 +59,16 @@ def motions_of_sweeps(
     Args:
         consecutive: earlier and later sweep of each pair.
         timing: how the time of a point follows from its azimuth, if the sweeps do not carry it.
-        search: of neighbours among the points of a sweep.
+
+    Raises:
+        SourceError: the optional extra `lidars` is not installed.
     """
     before, searches = np.zeros(6), 0
     for earlier, later in consecutive:
         if not 0 < later.stamp_ns - earlier.stamp_ns <= MAX_SEPARATION_S * 1e9:
             yield None
             continue
-        sweeps = _ConsecutiveSweeps(earlier, _some_points(later), timing, search)
+        sweeps = _ConsecutiveSweeps(earlier, _some_points(later), timing)
         ends = [sweeps.registered(before, ROUNDS), sweeps.registered(np.zeros(6), 1)]
         unambiguous = bool(before.any()) and _is_unambiguous(ends)
         if not unambiguous and searches < SEARCHES:
@@ -118,7 +120,6 @@ class _ConsecutiveSweeps:
     earlier: LidarFrame
     later: LidarFrame
     timing: SweepTiming | None
-    search: NeighbourSearch
 
     def registered(self, begin: Twist, rounds: int) -> _Registered:
         """The motion that at most so many registrations lead to from `begin` (6,)."""
@@ -128,7 +129,7 @@ class _ConsecutiveSweeps:
         for _ in range(rounds):
             wx, wy, wz, vx, vy, vz = twist.tolist()
             motion = EgoMotion(self.earlier.stamp_ns, self.earlier.frame_id, (vx, vy, vz), (wx, wy, wz))
-            edge = register(rig, [SweepPair(self.earlier, self.later, motion)], self.search)
+            edge = register(rig, [SweepPair(self.earlier, self.later, motion)])
             twist = se3.log(se3.perturb(se3.exp(twist * between_s), edge.correction)) / between_s
             largest = np.abs(edge.correction)
             if edge.reasons or (largest[:3].max() < RESTS_RAD and largest[3:].max() < RESTS_M):

@@ -23,7 +23,8 @@ from coec.calibration.frames.motion_compensation import sensor_twist
 from coec.calibration.frames.pairing import azimuth_offsets_s
 from coec.calibration.objective.landscape import scatter
 from coec.calibration.rig import lidar_sampling
-from coec.calibration.types import EgoMotion, LidarFrame, Matrix4, Neighbourhood, NeighbourSearch, Reason, SweepTiming
+from coec.calibration.rig.nearest_neighbours import KdTree
+from coec.calibration.types import EgoMotion, LidarFrame, Matrix4, Reason, SweepTiming
 from coec.geometry import se3
 from coec.geometry.linalg import congruent, eigen, inverted, solved
 from coec.geometry.points import lengths
@@ -206,18 +207,17 @@ LEAST_POINTS = 500
 """An edge needs at least this many points on surfaces, and at least `LEAST_SHARE` of those tried."""
 
 
-def register(
-    rig: lidar_sampling.LidarRig, pairs: Sequence[lidar_sampling.SweepPair], search: NeighbourSearch
-) -> lidar_sampling.LidarEdge:
+def register(rig: lidar_sampling.LidarRig, pairs: Sequence[lidar_sampling.SweepPair]) -> lidar_sampling.LidarEdge:
     """The pose of b in a that brings the points of b onto the surfaces of a.
 
     Raises:
         ValueError: no pair of sweeps.
+        SourceError: the optional extra `lidars` is not installed.
     """
     if not pairs:
         raise ValueError(f"{rig.a} and {rig.b}: no sweep of the one near a sweep of the other")
     clouds = [clouds_of(rig, pair) for pair in pairs]
-    indexed = [(cloud, search.over(cloud.a_m)) for cloud in clouds if len(cloud.a_m) >= NEIGHBOURS]
+    indexed = [(cloud, KdTree(cloud.a_m)) for cloud in clouds if len(cloud.a_m) >= NEIGHBOURS]
     T_a_b, bias = rig.T_a_b_nominal, np.zeros(2)
     for number in range(STEPS):
         reach_m = REACHES_M[min(number, len(REACHES_M) - 1)]
@@ -277,9 +277,7 @@ def _step(met: lidar_sampling.Met, weight: Doubles, known: Doubles) -> Doubles:
     return np.array(solved(information.tolist(), score.tolist()))
 
 
-def _meet(
-    indexed: Sequence[tuple[Cloud, Neighbourhood]], T_a_b: Matrix4, bias: Doubles, reach_m: float
-) -> lidar_sampling.Met:
+def _meet(indexed: Sequence[tuple[Cloud, KdTree]], T_a_b: Matrix4, bias: Doubles, reach_m: float) -> lidar_sampling.Met:
     """The points of b that lie within reach of a surface of a, at a pose and at the range biases of a and b."""
     parts = []
     tried = 0
@@ -295,7 +293,7 @@ def _meet(
 
 
 def _meet_one(
-    number: int, cloud: Cloud, a: Neighbourhood, T_a_b: Matrix4, bias: Doubles, reach_m: float
+    number: int, cloud: Cloud, a: KdTree, T_a_b: Matrix4, bias: Doubles, reach_m: float
 ) -> tuple[Doubles, Doubles, Doubles, NDArray[np.int64], Doubles]:
     b_m = cloud.b_m(T_a_b)
     ray_b = np.einsum("ij,nj->ni", T_a_b[:3, :3], b_m / lengths(b_m)[:, None])

@@ -22,7 +22,6 @@ alone leaves the centre of the start where it is.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import degrees, radians
-from typing import Protocol
 
 import nlopt
 import numpy as np
@@ -157,17 +156,29 @@ def maximise(objective: Objective, start: Matrix4, config: SearchConfig, progres
     return SearchResult(_pose(start, best), evaluations, stop_reason)
 
 
-class Constraint(Protocol):
-    """What a search keeps as it is."""
+TRANSLATIONS = range(3, 6)
+"""Places of the translations in ξ = [rx ry rz tx ty tz]."""
 
-    @property
-    def axes(self) -> tuple[int, ...]:
-        """Places in ξ that are not searched."""
-        ...
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FixedCentre:
+    """Keeps the camera's centre where it was along some axes of the camera.
+
+    Attributes:
+        axes: the kept axes, out of `TRANSLATIONS`.
+        prior: (4, 4) T_camera_lidar whose centre is kept.
+    """
+
+    axes: tuple[int, ...]
+    prior: Matrix4
 
     def __call__(self, T_camera_lidar: Matrix4) -> Matrix4:
-        """The nearest pose (4, 4) that obeys the constraint."""
-        ...
+        """The pose (4, 4) with its centre put back along the kept axes of that camera; its rotation stays."""
+        shifted = se3.difference(T_camera_lidar, self.prior)
+        pose = T_camera_lidar.copy()
+        for axis in self.axes:
+            pose[axis - TRANSLATIONS.start, 3] -= shifted[axis]
+        return pose
 
 
 def polish(
@@ -176,7 +187,7 @@ def polish(
     config: SearchConfig,
     progress: Progress,
     evaluations: int = 0,
-    constraint: Constraint | None = None,
+    constraint: FixedCentre | None = None,
 ) -> SearchResult:
     """The maximum next to `basin` (4, 4), within a few difference steps of the objective. `evaluations` were made
     before and are included in the result. Every pose that is tried obeys `constraint`."""
@@ -243,31 +254,6 @@ def _pose(start: Matrix4, coordinates: NDArray[np.float64]) -> Matrix4:
     perturbation = np.zeros(6)
     perturbation[: len(coordinates)] = coordinates
     return se3.perturb(start, perturbation)
-
-
-TRANSLATIONS = range(3, 6)
-"""Places of the translations in ξ = [rx ry rz tx ty tz]."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FixedCentre:
-    """Keeps the camera's centre where it was along some axes of the camera.
-
-    Attributes:
-        axes: the kept axes, out of `TRANSLATIONS`.
-        prior: (4, 4) T_camera_lidar whose centre is kept.
-    """
-
-    axes: tuple[int, ...]
-    prior: Matrix4
-
-    def __call__(self, T_camera_lidar: Matrix4) -> Matrix4:
-        """The pose (4, 4) with its centre put back along the kept axes of that camera; its rotation stays."""
-        shifted = se3.difference(T_camera_lidar, self.prior)
-        pose = T_camera_lidar.copy()
-        for axis in self.axes:
-            pose[axis - TRANSLATIONS.start, 3] -= shifted[axis]
-        return pose
 
 
 def unobservable(curvature: Curvature, sigma: NDArray[np.float64], dof: int, limits: VerdictConfig) -> tuple[int, ...]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from coec.calibration.frames import evidence
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.frames.window import BetweenPairs
+from coec.calibration.rig import nearest_neighbours
 from coec.calibration.rig.lidar_odometry import MAX_SEPARATION_S, motions_of_sweeps
 from coec.calibration.types import (
     MOUNT_RAD,
@@ -34,7 +35,6 @@ from coec.errors import DecodeError, MisreadError, SourceError, UsageError
 from coec.geometry import se3
 from coec.geometry.cameras import Camera
 from coec.geometry.projection import half_field_of_view_rad
-from coec.io import nearest_neighbours
 from coec.io.frame_validation import Refusal
 from coec.io.images import CompressingReducer, decode_grey_reduced
 from coec.io.mcap.windows import is_window, read_result, read_window
@@ -190,7 +190,7 @@ def _with_motion(
         for pair, stamp_ns in zip(pairs, neighbours, strict=True)
         for first, second in ((pair.lidar, sweeps.get(stamp_ns or 0, pair.lidar)),)
     ]
-    motions = list(motions_of_sweeps(consecutive, rig.sweep, nearest_neighbours.Trees()))
+    motions = list(motions_of_sweeps(consecutive, rig.sweep))
     measured = sum(motion is not None for motion in motions)
     if not measured:
         text = (

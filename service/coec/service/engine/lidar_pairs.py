@@ -14,13 +14,12 @@ from math import inf
 
 import numpy as np
 
-from coec.calibration.rig import lidar_sampling
+from coec.calibration.rig import lidar_sampling, nearest_neighbours
 from coec.calibration.rig.edge_observations import determined_covariance, observation_of_registration, window_of
 from coec.calibration.rig.graph import Edge
 from coec.calibration.rig.rig_estimator import EdgeWindow
 from coec.calibration.types import NS_PER_S, EgoMotion, Frame, LidarFrame, Matrix4, Reason, Rig
 from coec.config import LidarEdgesConfig, PairConfig
-from coec.io import nearest_neighbours
 from coec.io.rig_files import rig_of
 from coec.service.engine.messages import JobDone
 from coec.service.engine.rig import (

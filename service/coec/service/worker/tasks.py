@@ -18,6 +18,7 @@ from coec.calibration.commissioning import MAX_PAIRS, commission_in_steps
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.monitor.check_verdict import observe
 from coec.calibration.pipeline import calibrate
+from coec.calibration.rig import nearest_neighbours
 from coec.calibration.rig.lidar_registration import register
 from coec.calibration.rig.lidar_sampling import LidarRig, SweepPair
 from coec.config import CalibrationConfig, Config, DepthConfig
@@ -27,7 +28,6 @@ from coec.io.converter import structured
 from coec.io.depth.depth_maps import CachedDepth, open_depth
 from coec.io.images import CachedGreys, GreyImages, RangeScale, decode_bgr, encode_jpeg, scale_of, stable_scale
 from coec.io.msgpack_frames import decode_camera
-from coec.io.nearest_neighbours import Trees, installed
 from coec.io.rig_files import BASELINES, baseline_of_rig, rig_of, save_baseline
 from coec.reports.close_ups import Caption, close_ups
 from coec.reports.drawing import render_points, titled
@@ -122,11 +122,11 @@ class Solver:
         return list(alike.values())
 
     def _warm_up_lidars(self) -> None:
-        if not installed():
+        if not nearest_neighbours.installed():
             return
         window = invented_window(self._rigs[self._config.pairs[0].name])
         pairs = [SweepPair(pair.lidar, pair.lidar, pair.motion) for pair in window.pairs[:1]]
-        register(LidarRig("a", "b", np.eye(4), np.eye(4)), pairs, Trees())
+        register(LidarRig("a", "b", np.eye(4), np.eye(4)), pairs)
 
     def prefetch(self, pair: str, frame: bytes) -> None:
         """Infers the depth of a camera frame (native msgpack) that was chosen for an open window.
@@ -313,7 +313,7 @@ class Solver:
             DecodeError: a frame cannot be decoded.
         """
         rig = structured(worker_jobs.wire_form(), lidars, LidarRig)
-        edge = register(rig, worker_jobs.unpack_sweeps(frames, self._config.limits), Trees())
+        edge = register(rig, worker_jobs.unpack_sweeps(frames, self._config.limits))
         return worker_jobs.Registered(
             **{field.name: getattr(edge, field.name) for field in fields(worker_jobs.Registered)}
         )
