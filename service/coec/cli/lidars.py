@@ -39,10 +39,12 @@ def lidars(
 ) -> int:
     """Find the pose of one LiDAR in another from the surfaces that both see: exit 1 if those are too few."""
     from coec.calibration.rig.lidar_registration import register
+    from coec.calibration.rig.nearest_neighbours import require_installed
     from coec.geometry.se3 import difference
     from coec.io.recordings.layouts import open_lidars
     from coec.io.serialise import in_degrees
 
+    require_installed()
     recording = open_lidars(source, a, b)
     started_s = time.monotonic()
     with console.progress() as bars:

@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coec.calibration.rig import nearest_neighbours
 from coec.calibration.rig.lidar_sampling import LidarRig, RangeBias, SweepPair
 from coec.calibration.types import EgoMotion, LidarFrame, Reason, SweepTiming
 from coec.config import LimitsConfig
-from coec.errors import SourceError
 from coec.geometry import se3
 from coec.io.converter import structured
-from coec.service.worker import tasks
 from coec.service.worker.job_queue import JobQueue
 from coec.service.worker.tasks import Solver, answer_request
 from coec.service.worker.worker_jobs import (
@@ -107,10 +106,7 @@ def test_hostile_clouds_are_answered(solver: Solver, name: str) -> None:
 
 
 def test_without_the_extra_the_answer_says_what_to_install(solver: Solver, monkeypatch: pytest.MonkeyPatch) -> None:
-    def absent() -> None:
-        raise SourceError("LiDARs are registered with the optional extra `lidars`")
-
-    monkeypatch.setattr(tasks, "Trees", absent)
+    monkeypatch.setattr(nearest_neighbours, "installed", lambda: False)
     result = read_answer(answer_request(solver, question(sweeps())), Kind.REGISTER)
     assert isinstance(result, Reason)
     assert "extra `lidars`" in result.text

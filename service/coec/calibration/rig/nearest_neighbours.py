@@ -14,16 +14,21 @@ def installed() -> bool:
     return importlib.util.find_spec("small_gicp") is not None
 
 
+def require_installed() -> None:
+    """Raises SourceError, which says what to install, if the optional extra is not installed."""
+    if not installed():
+        raise SourceError("LiDARs are registered with the optional extra `lidars`: pip install 'coec[lidars]'")
+
+
 class KdTree:
     """Finite points (M, 3) in which the nearest ones can be looked up.
 
     Raises:
-        SourceError: the optional extra is not installed; says what to install.
+        SourceError: the optional extra is not installed.
     """
 
     def __init__(self, points_m: NDArray[np.float64]) -> None:
-        if not installed():
-            raise SourceError("LiDARs are registered with the optional extra `lidars`: pip install 'coec[lidars]'")
+        require_installed()
         import small_gicp
 
         self._tree = small_gicp.KdTree(points_m, num_threads=1)
