@@ -14,6 +14,13 @@ of a standard deviation, 0.005° of a correction, 4 of 120,000 points)."""
 ONLY_NEAR = "intrinsics_off"
 """A figure that is there or not by what the edges tell of the lens, which a last digit may decide."""
 
+FLAT = ("network mi",)
+"""Windows that are refused because their objective has no summit: the last digits of a depth network move the end of
+the search by more than a standard deviation."""
+
+ALONG_THE_FLAT = ("correction", "figures", "sigma")
+"""Values of such windows that are compared on the same kind of processor only."""
+
 
 @pytest.fixture(scope="module")
 def windows(tmp_path_factory: pytest.TempPathFactory) -> Windows:
@@ -39,6 +46,8 @@ def test_the_same_is_decided_of_the_same_window(name: str, windows: Windows, wri
     if not is_identical():
         for one in (before, after):
             one["values"]["figures"].pop(ONLY_NEAR, None)
+            for value in ALONG_THE_FLAT if name in FLAT else ():
+                del one["values"][value]
     assert not differences(before, after, Tolerance() if is_identical() else LOOSE)
     if is_identical():
         other = fields_that_differ(golden, now)
