@@ -3,8 +3,6 @@ Foxglove's schemas, written by Foxglove's SDK and as JSON."""
 
 from __future__ import annotations
 
-import base64
-import json
 import struct
 from functools import cache
 from pathlib import Path
@@ -28,6 +26,7 @@ from coec.io.recordings.recording_source import RecordingSource, parse_spec
 from coec.io.ros import messages
 from coec.io.ros.message_decoding import decode
 from coec.io.ros.translations import TRANSLATIONS, translation_of
+from support.encodings import foxglove_values, json_of, of_ros_1, protobuf_of
 from support.recordings import STORE, Bag, drive_messages
 from support.ros import Packer
 
@@ -59,11 +58,6 @@ def require_same(result: RecordingSource, expected: RecordingSource) -> None:
 @pytest.fixture
 def native(tmp_path: Path) -> RecordingSource:
     return open_source(str(Bag(DRIVE).write(tmp_path / "native.mcap")))
-
-
-def of_ros_1(message: Any) -> tuple[str, bytes]:
-    name = message.__msgtype__
-    return name, bytes(STORE.cdr_to_ros1(STORE.serialize_cdr(message, name), name))
 
 
 def ros_1_bag(path: Path, compression: Rosbag1.CompressionFormat | None = None) -> Path:
@@ -212,84 +206,6 @@ def test_a_folder_of_recorded_windows_is_no_bag(tmp_path: Path, native: Recordin
 
 
 # --- Foxglove -------------------------------------------------------------------------------------------------------
-
-
-def foxglove_values(message: Any) -> tuple[str, dict[str, Any]]:
-    """Schema and fields of a message of the drive."""
-    header = getattr(message, "header", None)
-    head = {}
-    if header is not None:
-        stamp = {"sec": header.stamp.sec, "nsec": header.stamp.nanosec}
-        head = {"timestamp": stamp, "frame_id": header.frame_id}
-    match message.__msgtype__:
-        case "sensor_msgs/msg/CompressedImage":
-            return "CompressedImage", {**head, "data": message.data.tobytes(), "format": "jpeg"}
-        case "sensor_msgs/msg/PointCloud2":
-            fields = [{"name": field.name, "offset": field.offset, "type": 7} for field in message.fields]
-            cloud = {"point_stride": message.point_step, "fields": fields, "data": message.data.tobytes()}
-            return "PointCloud", {**head, **cloud}
-        case "sensor_msgs/msg/CameraInfo":
-            matrices = {name.upper(): getattr(message, name).tolist() for name in "dkrp"}
-            size = {"width": message.width, "height": message.height}
-            return "CameraCalibration", {**head, **size, **matrices, "distortion_model": message.distortion_model}
-        case "tf2_msgs/msg/TFMessage":
-            return "FrameTransforms", {"transforms": [foxglove_transform(one) for one in message.transforms]}
-        case "nav_msgs/msg/Odometry":
-            twist, pose = message.twist.twist, message.pose.pose
-            place, turn = vector(pose.position), {axis: getattr(pose.orientation, axis) for axis in "xyzw"}
-            velocities = {"linear_velocity": vector(twist.linear), "angular_velocity": vector(twist.angular)}
-            motion = {"body_frame_id": message.child_frame_id, "pose": {"position": place, "orientation": turn}}
-            return "Odometry", {**head, **motion, **velocities}
-    raise AssertionError
-
-
-def vector(message: Any) -> dict[str, float]:
-    return {axis: getattr(message, axis) for axis in "xyz"}
-
-
-def foxglove_transform(stamped: Any) -> dict[str, Any]:
-    turn = stamped.transform.rotation
-    return {
-        "parent_frame_id": stamped.header.frame_id,
-        "child_frame_id": stamped.child_frame_id,
-        "translation": vector(stamped.transform.translation),
-        "rotation": {axis: getattr(turn, axis) for axis in "xyzw"},
-    }
-
-
-def protobuf_of(schema: str, values: dict[str, Any]) -> bytes:
-    """The message as Foxglove's SDK encodes it."""
-    sdk = pytest.importorskip("foxglove.messages")
-
-    def built(name: str, fields: dict[str, Any]) -> Any:
-        made = dict(fields)
-        if "timestamp" in made:
-            made["timestamp"] = sdk.Timestamp(**made["timestamp"])
-        if "translation" in made:
-            made["translation"] = sdk.Vector3(**made["translation"])
-            made["rotation"] = sdk.Quaternion(**made["rotation"])
-        for key in {"linear_velocity", "angular_velocity", "position"} & made.keys():
-            made[key] = sdk.Vector3(**made[key])
-        if "orientation" in made:
-            made["orientation"] = sdk.Quaternion(**made["orientation"])
-        if "pose" in made:
-            made["pose"] = built("Pose", made["pose"])
-        if "transforms" in made:
-            made["transforms"] = [built("FrameTransform", one) for one in made["transforms"]]
-        if "fields" in made:
-            kind = sdk.PackedElementFieldNumericType.Float32
-            made["fields"] = [
-                sdk.PackedElementField(name=f["name"], offset=f["offset"], type=kind) for f in made["fields"]
-            ]
-        return getattr(sdk, name)(**made)
-
-    return bytes(built(schema, values).encode())
-
-
-def json_of(schema: str, values: dict[str, Any]) -> bytes:
-    del schema
-    text = {**values, "data": base64.b64encode(values["data"]).decode()} if "data" in values else values
-    return json.dumps(text).encode()
 
 
 @pytest.mark.parametrize("encoding", ["protobuf", "json"])

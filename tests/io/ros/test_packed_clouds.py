@@ -25,6 +25,14 @@ from coec.errors import DecodeError, SourceError
 from coec.io.recordings.layouts import open_source
 from coec.io.ros import messages
 from coec.io.ros.message_decoding import decode
+from support.encodings import (
+    of_cloudini,
+    of_draco,
+    of_zlib,
+    of_zstd,
+    packed_cloud_of,
+    packed_message,
+)
 from support.recordings import Bag, drive_messages
 from support.ros import STAMP_NS, Packer
 
@@ -46,54 +54,8 @@ def points() -> NDArray[Any]:
     return rows
 
 
-def message(
-    form: str, packed: bytes, *, width: int = COUNT, height: int = 1, step: int = POINT.itemsize, fields: Any = FIELDS
-) -> bytes:
-    """`point_cloud_interfaces/CompressedPointCloud2` in CDR."""
-    packer = Packer().header("lidar").put("I", height, width, len(fields))
-    for name, offset, datatype in fields:
-        packer.text(name).put("I", offset).put("B", datatype).put("I", 1)
-    packer.put("?", False).put("I", step, width * step % 2**32).octets(packed).put("?", True)
-    return packer.text(form).done()
-
-
-def of_zlib(rows: NDArray[Any]) -> bytes:
-    return zlib.compress(rows.tobytes())
-
-
-def of_zstd(rows: NDArray[Any]) -> bytes:
-    return zstandard.compress(rows.tobytes())
-
-
-def of_cloudini(rows: NDArray[Any], **options: Any) -> bytes:
-    pureini = pytest.importorskip("pureini", reason="needs the extra cloudini")
-    fields = [pureini.PointField(name, offset, pureini.FieldType(kind)) for name, offset, kind in FIELDS]
-    info = pureini.EncodingInfo(
-        fields,
-        width=len(rows),
-        point_step=POINT.itemsize,
-        encoding_opt=pureini.EncodingOptions.LOSSLESS,
-        compression_opt=pureini.CompressionOption.ZSTD,
-        **options,
-    )
-    return bytes(pureini.PointcloudEncoder(info).encode(rows.tobytes()))
-
-
-def of_draco(rows: NDArray[Any], *, kd_tree: bool = False) -> bytes:
-    """One attribute of three components for the position; the others in the order of the fields, with their names."""
-    draco = pytest.importorskip("DracoPy", reason="needs the extra draco")
-    xyz = np.stack([rows[axis] for axis in "xyz"], axis=1)
-    others = {name: rows[name].astype(np.uint32)[:, None] for name in ("ring", "t")}
-    others["intensity"] = rows["intensity"][:, None]
-    return bytes(
-        draco.encode(
-            xyz,
-            quantization_bits=20,
-            preserve_order=not kd_tree,
-            create_metadata=True,
-            generic_attributes={name: others[name] for name in ("intensity", "ring", "t")},
-        )
-    )
+def message(form: str, packed: bytes, *, width: int = COUNT, fields: Any = FIELDS) -> bytes:
+    return packed_message(Packer().header("lidar"), form, packed, width, POINT.itemsize, fields)
 
 
 def sweep_of(payload: bytes, type_name: str = messages.COMPRESSED_CLOUD) -> LidarFrame:
@@ -210,12 +172,7 @@ def bag_of_packed(folder: Path, form: str, pack: Callable[[NDArray[Any]], bytes]
         channel = writer.register_channel("/points/packed", "cdr", schema)
         for time, (topic, one) in enumerate(drive):
             if topic == "/points":
-                rows = np.frombuffer(one.data.tobytes(), np.dtype((np.void, one.point_step)))
-                fields = [(field.name, field.offset, field.datatype) for field in one.fields]
-                packer = message(form, pack(rows), width=one.width, step=one.point_step, fields=fields)
-                head = Packer().header(one.header.frame_id, one.header.stamp.sec, one.header.stamp.nanosec).done()
-                body = packer[len(Packer().header("lidar").done()) :]
-                writer.add_message(channel, time, head + body, time)
+                writer.add_message(channel, time, packed_cloud_of(one, form, pack), time)
         writer.finish()  # type: ignore[no-untyped-call]
     return str(folder)
 
