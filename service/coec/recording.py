@@ -157,7 +157,7 @@ def solve(loaded: LoadedWindow, options: CalibrationOptions, progress: calibrati
     else:
         estimate, mistake = calibrated(window, depth, images, configuration, progress)
     if estimate.verdict.decision is not calibration.Decision.ACCEPTED:
-        mistake = _mistake_of_recording(loaded, mistake)
+        mistake = mistake_of_recording(loaded, mistake)
     offset = None
     if options.get("time_offset"):
         offset = estimate_time_offset(window, images, estimate.optimum.T_camera_lidar, configuration)
@@ -216,23 +216,28 @@ def calibrated(
 OF_TIMING = (CLOCK_OFFSET, COMPENSATED, BACKWARDS, MOTION_AXES, MOTION_UNIT)
 """Mistakes that irregular stamps or wrong velocities look like."""
 
-OF_RECORDING: Mapping[str, tuple[str, tuple[str, ...]]] = MappingProxyType(
+OF_RECORDING: Mapping[str, tuple[str, tuple[str, ...] | None]] = MappingProxyType(
     {
+        "clocks_apart": ("each image is compared with a sweep of another time.", None),
+        "several_cameras": ("the images are those of several cameras.", None),
+        "transform_changes": ("the pose from which the search starts may be one that no longer holds.", (CLOCK_OFFSET,)),
+        "viewpoint": ("points that a tool has moved are not where the LiDAR measured them.", (CLOCK_OFFSET,)),
+        "header_clock": ("messages of other times do not fit each other.", OF_TIMING),
         STAMPS_IRREGULAR: ("sweeps and images of other instants do not fit each other.", OF_TIMING),
         TWIST_CONTRADICTED: ("sweeps that are compensated for wrong motion are distorted.", OF_TIMING),
         MOTION_LEFT_OUT: ("sweeps without motion compensation are distorted; lens or mount seem other ones.", ()),
     }
 )
 """What was recognised of a recording and may be why it is refused, with what follows from it, and the mistakes that it
-looks like."""
+looks like; None: any."""
 
 
-def _mistake_of_recording(loaded: LoadedWindow, named: calibration.Mistake | None) -> calibration.Mistake | None:
-    """What was recognised of a recording as the probable cause of a refusal; else the one that was `named`."""
+def mistake_of_recording(loaded: LoadedWindow, named: calibration.Mistake | None) -> calibration.Mistake | None:
+    """What was recognised of a recording as the probable cause of its refusal; else the one that was `named`."""
     rig = loaded.window.rig
     for code, (follows, resembled) in OF_RECORDING.items():
         recognised = next((one for one in loaded.recognitions if one.code == code), None)
-        if recognised is not None and (named is None or named.code in resembled):
+        if recognised is not None and (named is None or resembled is None or named.code in resembled):
             text = f"{follows} {recognised.text}"
             return calibration.Mistake(code, text, nan, nan, rig.camera, rig.T_camera_lidar_nominal, correctable=False)
     return named

@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
 from cli.conftest import Coec
-from coec.calibration.types import CameraFrame, LidarFrame, Rig
+from coec.calibration.types import CameraFrame, LidarFrame, Mistake, Recognition, Rig, Window
 from coec.geometry import cameras, se3
 from coec.geometry.cameras import Camera, scaled
 from coec.io.recordings.layouts import open_source
+from coec.io.recordings.window_cutting import LoadedWindow
+from coec.recording import mistake_of_recording
 from support.simulated_drives import rendered_source
 
 STREET = "sim:seed=5&seconds=48&camera_hz=0.17&lidar_hz=0.17&camera=pinhole640x320&lidar=32&depth=yes"
@@ -97,3 +99,28 @@ def test_check_names_intrinsics_of_another_size_and_fixes_them(coec: Coec, tmp_p
 def test_only_a_manifest_can_be_fixed(coec: Coec) -> None:
     outcome = coec("calibrate", STREET, "--depth", "stereo", "--fix")
     assert (outcome.status, "--fix writes a corrected dataset.yaml" in outcome.err) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("recognised", "named", "cause"),
+    [
+        ("clocks_apart", "inverse_pose", "clocks_apart"),
+        ("several_cameras", "clock_offset", "several_cameras"),
+        ("viewpoint", "clock_offset", "viewpoint"),
+        ("viewpoint", None, "viewpoint"),
+        ("transform_changes", "clock_offset", "transform_changes"),
+        ("transform_changes", "inverse_pose", "inverse_pose"),
+        ("header_clock", "already_compensated", "header_clock"),
+        ("header_clock", "focal_length", "focal_length"),
+        ("camera_info_empty", None, None),
+    ],
+)
+def test_what_was_recognised_is_named_before_what_it_looks_like(
+    rig: Rig, recognised: str, named: str | None, cause: str | None
+) -> None:
+    window = Window("front-1", rig, rig.T_camera_lidar_nominal, (), 0.1)
+    loaded = LoadedWindow(window, None, "car", {}, (Recognition(recognised, "As recognised.", "warn"),))
+    of_window = named and Mistake(named, "", 9.0, 1.0, rig.camera, rig.T_camera_lidar_nominal, correctable=False)
+    mistake = mistake_of_recording(loaded, of_window or None)
+    assert (None if mistake is None else mistake.code) == cause
+    assert mistake is None or mistake is of_window or mistake.text.endswith(" As recognised.")

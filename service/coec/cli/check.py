@@ -64,7 +64,8 @@ def check(
         remarks = (replace(n, level="warn", text=enough) if n.code == TOO_FEW else n for n in seen.remarks)
         seen = replace(seen, remarks=tuple(remarks))
     of_mistake = () if mistake is None else (Notice("fail", mistake.code, mistake.text),)
-    every = (*of_mistake, *seen.remarks, *_of_trial(trial, seen, mistake))
+    others = (note for note in seen.remarks if mistake is None or note.code != mistake.code)
+    every = (*of_mistake, *others, *_of_trial(trial, seen, mistake))
     notes = tuple(sorted(every, key=lambda note: list(LEVEL_STYLES).index(note.level)))  # the most important first
     console.report(
         _document(source, replace(seen, remarks=notes), trial, mistake),
@@ -85,14 +86,17 @@ def _trial(
     from coec.io.depth.depth_maps import open_depth
     from coec.io.images import GreyImages
     from coec.io.recordings import window_cutting
-    from coec.recording import MistakenInputError, calibrated
+    from coec.recording import MistakenInputError, calibrated, mistake_of_recording
 
     loaded = window_cutting.window_of_recording(recording, PAIRS, lambda done, total: times.step("load", done, total))
     window = loaded.window
     configuration = configuration_of(SolverOptions(depth=depth), loaded.configuration)
     limits = LimitsConfig()
     try:
-        return calibrated(window, open_depth(configuration.depth, limits), GreyImages(limits), configuration, times)
+        trial, mistake = calibrated(
+            window, open_depth(configuration.depth, limits), GreyImages(limits), configuration, times
+        )
+        return trial, mistake if _is_accepted(trial) else mistake_of_recording(loaded, mistake)
     except MistakenInputError as error:
         return error, error.mistake
     except CalibrationError as error:

@@ -498,7 +498,8 @@ def _extrinsic(index: BagIndex, pair: PairMessages, lens: _Lens) -> tuple[Matrix
         recognised, named, T = (Recognition("camera_frame", text, "warn"),), optical, T_optical
     changes = index.transforms.changes(named, lidar_frame)
     if changes:
-        recognised = (*recognised, Recognition("transform_changes", f"/tf_static: {'; '.join(changes)}.", "warn"))
+        text = f"/tf_static: {'; '.join(changes)}. ?intrinsics=FILE with `T_camera_lidar:` gives another."
+        recognised = (*recognised, Recognition("transform_changes", text, "warn"))
     return T, recognised
 
 
