@@ -220,7 +220,7 @@ OF_RECORDING: Mapping[str, tuple[str, tuple[str, ...] | None]] = MappingProxyTyp
     {
         "clocks_apart": ("each image is compared with a sweep of another time.", None),
         "several_cameras": ("the images are those of several cameras.", None),
-        "transform_changes": ("the pose from which the search starts may be one that no longer holds.", (CLOCK_OFFSET,)),
+        "transform_changes": ("the pose at which the search starts may be one that no longer holds.", (CLOCK_OFFSET,)),
         "viewpoint": ("points that a tool has moved are not where the LiDAR measured them.", (CLOCK_OFFSET,)),
         "header_clock": ("messages of other times do not fit each other.", OF_TIMING),
         STAMPS_IRREGULAR: ("sweeps and images of other instants do not fit each other.", OF_TIMING),

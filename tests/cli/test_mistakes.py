@@ -115,7 +115,7 @@ def test_only_a_manifest_can_be_fixed(coec: Coec) -> None:
         ("camera_info_empty", None, None),
     ],
 )
-def test_what_was_recognised_is_named_before_what_it_looks_like(
+def test_what_was_recognised_is_named_before_what_it_resembles(
     rig: Rig, recognised: str, named: str | None, cause: str | None
 ) -> None:
     window = Window("front-1", rig, rig.T_camera_lidar_nominal, (), 0.1)

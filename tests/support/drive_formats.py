@@ -248,17 +248,17 @@ class Hdl32:
     """The lasers fire one after the other while the head turns clockwise from the rear."""
 
     beams, ringed = 32, True
-    elevations = np.radians(-92 / 3 + 4 / 3 * np.arange(32))
+    elevations: NDArray[np.float64] = np.radians(-92 / 3 + 4 / 3 * np.arange(32))
 
     def fired(self, time_s: float, period_s: float) -> Fired:  # noqa: ARG002 - the same at any time
         later = laser_of(np.arange(32)) * LASER_S / FIRING_S
-        azimuth = np.pi - 2 * np.pi * (np.arange(FIRINGS)[:, None] + later) / FIRINGS
+        azimuth: NDArray[np.float64] = np.pi - 2 * np.pi * (np.arange(FIRINGS)[:, None] + later) / FIRINGS
         rays: list[NDArray[np.float64]] = [
             np.cos(azimuth) * np.cos(self.elevations),
             np.sin(azimuth) * np.cos(self.elevations),
         ]
         rays.append(np.broadcast_to(np.sin(self.elevations), azimuth.shape))
-        offset_s = FIRING_S * (np.arange(FIRINGS) - FIRINGS / 2)
+        offset_s = FIRING_S * (np.arange(FIRINGS) - FIRINGS / 2).astype(np.float64)
         return Fired(np.stack(rays, axis=-1), offset_s)
 
 
