@@ -19,7 +19,7 @@ from coec.calibration.search.mistakes import changed
 from coec.calibration.solver import WindowData
 from coec.calibration.types import CameraFrame, CloudFrame, Mistake, Rig, Window
 from coec.config import DepthConfig, LimitsConfig
-from coec.geometry import se3
+from coec.geometry import cameras, se3
 from coec.io.depth.depth_maps import open_depth
 from coec.io.images import GreyImages
 from coec.io.recordings.layouts import open_source
@@ -178,6 +178,36 @@ def test_raw_images_with_intrinsics_that_have_no_distortion_are_named(few: Windo
     assert (mistake.code, mistake.correctable) == (mistakes.DISTORTION, False)
 
 
+def test_rectified_images_are_supposed_of_every_model_with_the_scale_of_its_centre(few: Window) -> None:
+    size = {"width": few.rig.camera.width, "height": few.rig.camera.height, "cx": 320.0, "cy": 160.0}
+    double_sphere = cameras.build("double_sphere", **size, fx=180.0, fy=181.0, xi=-0.2, alpha=0.6)
+    supposed = mistakes.suppositions(replace(few.rig, camera=double_sphere))
+    rectified = [one.camera for one in supposed if one.code == mistakes.RECTIFIED]
+    assert all(cameras.name_of(camera) == "pinhole" for camera in rectified)
+    assert (rectified[0].fx, rectified[0].fy) == pytest.approx((180.0 / 0.8, 181.0 / 0.8), rel=1e-6)
+    assert min(camera.fx for camera in rectified) < 180.0
+
+
+RADII: tuple[Callable[[float], float], ...] = (
+    lambda angle: angle,
+    lambda angle: float(2.0 * np.sin(0.5 * angle)),
+    lambda angle: float(2.0 * np.tan(0.5 * angle)),
+)
+
+
+@pytest.mark.parametrize(("terms", "radius"), list(zip(mistakes.FISHEYES, RADII, strict=True)))
+def test_fisheyes_without_distortion_are_the_classical_ones(
+    terms: tuple[float, float, float], radius: Callable[[float], float]
+) -> None:
+    k1, k2, k3 = terms
+    lens = cameras.build(
+        "kannala_brandt", width=200, height=200, fx=100.0, fy=100.0, cx=0.0, cy=0.0, k1=k1, k2=k2, k3=k3, k4=0.0
+    )
+    for angle in np.radians([10.0, 45.0, 70.0]):
+        seen_px = cameras.project_point(lens, np.sin(angle), 0.0, np.cos(angle))[0]
+        assert seen_px == pytest.approx(100.0 * radius(angle), rel=2e-3)
+
+
 def test_an_inverse_pose_with_another_focal_length_is_named(few: Window) -> None:
     wrong = wrong_pose(mistakes.INVERSE_POSE, wrong_lens(mistakes.FOCAL_LENGTH, approximate(few.rig)))
     mistake = named(given(few, wrong))
@@ -288,9 +318,10 @@ def test_motion_in_other_axes_is_named(street: Window) -> None:
     assert (mistake.code, mistake.correctable) == (mistakes.MOTION_AXES, False)
 
 
-def test_velocities_in_kilometres_per_hour_are_named(street: Window) -> None:
+@pytest.mark.parametrize(("linear", "angular"), [(3.6, 1.0), (1.0, 180.0 / np.pi)])
+def test_velocities_and_turns_in_other_units_are_named(street: Window, linear: float, angular: float) -> None:
     fast = tuple(
-        replace(pair, motion=None if pair.motion is None else pair.motion.in_axes(np.eye(3), linear=3.6))
+        replace(pair, motion=None if pair.motion is None else pair.motion.in_axes(np.eye(3), linear, angular))
         for pair in street.pairs
     )
     mistake = named(replace(street, pairs=fast))

@@ -154,6 +154,10 @@ NOT_CORRECTABLE = (BACKWARDS, MOTION_AXES, MOTION_UNIT, COMPENSATED, CLOCK_OFFSE
 UNITS = ((1.0 / 3.6, 1.0), (1.0, pi / 180.0))
 """What velocities in km/h and turns in degrees per second have to be multiplied by: linear, angular."""
 
+OTHER_UNITS = ((0.5 / 3.6, 1.0), (2.0 / 3.6, 1.0), (1.0, 0.1))
+"""Factors that are none of a unit. Of sweeps and images of other instants less motion fits better, whatever the factor;
+a sixtieth of a turn hardly differs from less."""
+
 SAME_RAD = radians(5.0)
 """Poses nearer than this are one explanation."""
 
@@ -378,9 +382,7 @@ def _other_time(data: WindowData, edges: Edges, given: Ranked) -> tuple[float, R
     if same is not None:
         rivals += [end for _, end in ends[1:] if end.supposition.code not in same]
     if best.supposition.code == MOTION_UNIT:
-        # Of sweeps and images of other instants, less motion fits better, whatever the factor.
-        near = [tuple(step * f if f < 1.0 else 1.0 for f in factors) for factors in UNITS for step in (0.7, 1.4)]
-        rivals += [settled(MOTION_UNIT, _with_motion(part, np.eye(3), *factors)) for factors in near]
+        rivals += [settled(MOTION_UNIT, _with_motion(part, np.eye(3), *factors)) for factors in OTHER_UNITS]
     certain = best.log_posterior >= max(rival.log_posterior for rival in rivals) + log(LEAST_ODDS)
     return (late_s, best) if certain else (0.0, None)
 

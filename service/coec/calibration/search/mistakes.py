@@ -58,7 +58,7 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
             "transpose the rotation",
         ),
         INVERSE_TRANSLATION: Kind(
-            0.02,
+            0.1,
             "the translation read as the position of the other sensor",
             "the translation of T_camera_lidar is probably the position of the camera in the LiDAR frame: "
             "t = -R·position",
@@ -195,15 +195,16 @@ SCALES = (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.75, 4.0 / 3.0, 1.5, 2.0, 3.0, 4.0)
 NOTICEABLE = 0.03
 """Share of the image by which a lens has to displace pixels to be tried. The posterior finds what is less."""
 
-DISTORTED = ("radtan", "rational", "kannala_brandt")
-"""Models whose images are commonly rectified."""
-
 RECTIFIED_ZOOMS = (1.0, 0.85, 0.72, 0.61, 0.52)
 """Ratios of the focal length of a rectified image to that of the raw one, which may be less, to hold more of the
 view."""
 
 BARRELS = ((-0.35, 0.15), (-0.2, 0.04))
 """Radial terms k1 and k2 of common lenses: half of the view 45° and 30° wide."""
+
+FISHEYES = ((0.0, 0.0, 0.0), (-1 / 24, 1 / 1920, -1 / 322_560), (1 / 12, 1 / 120, 17 / 20_160))
+"""Terms k1 to k3 of the classical projections of fisheyes, as series in the angle θ from the optical axis: equidistant
+(θ), equisolid (2·sin θ/2) and stereographic (2·tan θ/2)."""
 
 LEAST_SCALE, OFF_MIDDLE = 0.1, 0.15
 """Least relative difference of the two sizes, and how far a principal point lies off the middle at most, as a share of
@@ -360,18 +361,27 @@ def _lenses(camera: Camera) -> Iterator[tuple[str, Camera]]:
         yield CENTRE_SWAPPED, swapped
     if abs(fx / fy - 1.0) >= UNEQUAL_FOCAL_LENGTHS:
         yield FOCAL_LENGTHS_SWAPPED, changed(camera, fx=fy, fy=fx)
-    size = {"width": camera.width, "height": camera.height}
-    pinhole = cameras.build("pinhole", **size, fx=fx, fy=fy, cx=cx, cy=cy)
-    ray = (0.4 * camera.width / fx, 0.0, 1.0)
+    pinhole = _undistorted(camera)
+    ray = (0.4 * camera.width / pinhole.fx, 0.0, 1.0)
     displaced_px = cameras.project_point(camera, *ray)[0] - cameras.project_point(pinhole, *ray)[0]
-    if cameras.name_of(camera) in DISTORTED and abs(displaced_px) > NOTICEABLE * camera.width:
+    if abs(displaced_px) > NOTICEABLE * camera.width:
         for zoom in RECTIFIED_ZOOMS:
             yield RECTIFIED, zoomed(pinhole, zoom)
-    if abs(displaced_px) <= NOTICEABLE * camera.width:
+    else:
         of_pinhole = cameras.intrinsics_of(pinhole)
-        yield DISTORTION, cameras.build("kannala_brandt", **of_pinhole, k1=0.0, k2=0.0, k3=0.0, k4=0.0)
+        for k1, k2, k3 in FISHEYES:
+            yield DISTORTION, cameras.build("kannala_brandt", **of_pinhole, k1=k1, k2=k2, k3=k3, k4=0.0)
         for k1, k2 in BARRELS:
             yield DISTORTION, cameras.build("radtan", **of_pinhole, k1=k1, k2=k2, k3=0.0, p1=0.0, p2=0.0)
+
+
+def _undistorted(camera: Camera) -> Camera:
+    """The pinhole camera that agrees with a camera next to the optical axis."""
+    off = 1e-4
+    fx = (cameras.project_point(camera, off, 0.0, 1.0)[0] - camera.cx) / off
+    fy = (cameras.project_point(camera, 0.0, off, 1.0)[1] - camera.cy) / off
+    size = {"width": camera.width, "height": camera.height}
+    return cameras.build("pinhole", **size, fx=fx, fy=fy, cx=camera.cx, cy=camera.cy)
 
 
 def zoomed(camera: Camera, zoom: float) -> Camera:
