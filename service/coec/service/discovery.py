@@ -17,8 +17,10 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
+from coec.calibration.frames.evidence import sees_alone
 from coec.calibration.types import ImageFormat, Matrix4, Reason
 from coec.config import (
     IDENTITY,
@@ -90,7 +92,8 @@ class ReceivedMetadata:
     `packets` names the LiDAR whose packets came, with what is to be said of it.
     `names` has the frames that the latest messages of a stream (`camera`, `lidar`) name.
     `refused` says for a source (`camera`, `lidar`, `ego`, `info`) why its latest message could not be used.
-    `max_message_bytes` is the largest message that the session lets through."""
+    `max_message_bytes` is the largest message that the session lets through. `points_m` are some points (N, 3) of the
+    latest cloud."""
 
     image: ReceivedImage | None = None
     cloud: str | None = None
@@ -100,6 +103,7 @@ class ReceivedMetadata:
     names: dict[str, deque[str]] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
     max_message_bytes: int = LimitsConfig().max_message_bytes
+    points_m: NDArray[np.float32] | None = None
 
     def add_name(self, stream: str, frame_id: str) -> None:
         """Notes the frame that a message of a stream names."""
@@ -152,7 +156,7 @@ def discover(
     camera_frame, cloud_frame = search.resolve(search.camera_frame), search.resolve(search.cloud_frame)
     lidar_frame = pair.lidar.frame_id or cloud_frame
     T_cloud_lidar = search.resolve(search.T_cloud_lidar, cloud_frame, lidar_frame)
-    T_camera_lidar = search.resolve(search.T_camera_lidar, camera_frame, lidar_frame)
+    T_camera_lidar = search.resolve(lambda: search.T_camera_lidar(camera_frame, lidar_frame, intrinsics))
     T_lidar_ego = search.resolve(search.T_lidar_ego, lidar_frame)
     if search.missing:
         return tuple(search.missing)
@@ -265,17 +269,33 @@ class _Search:
             return given
         return IDENTITY if bare(cloud) == bare(lidar) else self._rows(CLOUD, cloud, lidar)
 
-    def T_camera_lidar(self, camera: str | None, lidar: str | None) -> Matrix4x4 | None:
+    def T_camera_lidar(
+        self, camera: str | None, lidar: str | None, intrinsics: CameraIntrinsics | None
+    ) -> Matrix4x4 | None:
         given, info = self._pair.T_camera_lidar, self._received.info
         if given is not None or camera is None or lidar is None:
             return given
-        optical = None if info is None or self._transforms.transform(camera, lidar) is not None else info.frame_id
-        if not optical or self._transforms.transform(optical, lidar) is None:
+        optical = "" if info is None else info.frame_id
+        if not optical or not self._is_body(camera, optical, lidar, intrinsics):
             return self._rows(EXTRINSIC, camera, lidar)
         # A driver may name another frame in its images than in the CameraInfo, which is that of the lens.
         rows = self._rows(EXTRINSIC, optical, lidar)
         self.origins[EXTRINSIC] += f"; the frame is that of the CameraInfo, the images name {_named(camera)}"
         return rows
+
+    def _is_body(self, camera: str, optical: str, lidar: str, lens: CameraIntrinsics | None) -> bool:
+        """Whether the frame of the images is not that of the camera, but that of the `CameraInfo` is: transforms lead
+        only from there to the LiDAR, or points of the latest cloud lie only there before the camera."""
+        frames = [self._transforms.known(frame) for frame in (optical, camera)]
+        T_optical, T_camera = (self._transforms.transform(frame, self._transforms.known(lidar)) for frame in frames)
+        if T_optical is None or T_camera is None:
+            return T_optical is not None
+        cloud = self._transforms.known(self._received.cloud or lidar)
+        poses = [self._transforms.transform(frame, cloud) for frame in frames]
+        points_m = self._received.points_m
+        if lens is None or points_m is None or any(pose is None for pose in poses):
+            return False
+        return sees_alone(*(_share_in_view(lens, pose, points_m) for pose in poses if pose is not None))
 
     def T_lidar_ego(self, lidar: str | None) -> Matrix4x4 | None:
         ego, frame = self._pair.ego, self._received.ego
@@ -288,6 +308,13 @@ class _Search:
         return IDENTITY if bare(frame) == bare(lidar) else self._rows(EGO, lidar, frame)
 
     def _rows(self, place: str, target: str, source: str) -> Matrix4x4 | None:
+        known = [self._transforms.known(frame) for frame in (target, source)]
+        taken = [
+            f"{_named(frame)} is taken for {_named(other)}"
+            for frame, other in zip((target, source), known, strict=True)
+            if frame != other
+        ]
+        target, source = known
         T_target_source = self._transforms.transform(target, source)
         names = f"{_named(target)} and {_named(source)}"
         if T_target_source is None:
@@ -300,7 +327,7 @@ class _Search:
                 Reason("tf_static_no_tree", f"{TF_STATIC} is no tree between {names}: {'; '.join(doubts)}.")
             )
         changes = self._transforms.changes(target, source)
-        self.origins[place] = "; ".join((f"{TF_STATIC}, between {names}", *changes))
+        self.origins[place] = "; ".join((f"{TF_STATIC}, between {names}", *taken, *changes))
         return matrix_rows(T_target_source)
 
     def _require_one_frame(self, stream: str, what: str, config: AnyStreamConfig, place: str) -> None:
@@ -338,8 +365,12 @@ def change_since(
         (EGO, ego, built.lidar.frame_id, received.ego),
     ):
         if place in discovered.origins and rows is not None and target is not None and source is not None:
-            T_now = transforms.transform(target, source)
-            if T_now is not None and _differ(np.array(rows), T_now):
+            targets = [target]
+            if place == EXTRINSIC and received.info is not None:
+                targets.append(received.info.frame_id)  # which may be the frame of the camera
+            now_there = [transforms.transform(transforms.known(one), transforms.known(source)) for one in targets]
+            known = [T_now for T_now in now_there if T_now is not None]
+            if known and all(_differ(np.array(rows), T_now) for T_now in known):
                 changes.append(f"{TF_STATIC}, for {place}")
     if not changes:
         return None
@@ -349,6 +380,15 @@ def change_since(
         "directory, and start it."
     )
     return Reason("nominal_changed", text)
+
+
+def _share_in_view(lens: CameraIntrinsics, T_camera_cloud: Matrix4, points_m: NDArray[np.float32]) -> float:
+    """Share of the points (N, 3) within the angle to the axis at which the farthest corner lies at most, whatever the
+    lens."""
+    p_camera = points_m.astype(np.float64) @ T_camera_cloud[:3, :3].T + T_camera_cloud[:3, 3]
+    corner = np.hypot(max(lens.cx, lens.width - lens.cx) / lens.fx, max(lens.cy, lens.height - lens.cy) / lens.fy)
+    angle_rad = np.arctan2(np.hypot(p_camera[:, 0], p_camera[:, 1]), p_camera[:, 2])
+    return float((angle_rad <= corner).mean()) if len(angle_rad) else 0.0
 
 
 def _differ(T_a: Matrix4, T_b: Matrix4) -> bool:

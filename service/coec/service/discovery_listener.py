@@ -44,6 +44,9 @@ second."""
 IDLE_S = 0.25
 """Time between two turns, s."""
 
+POINTS = 2000
+"""How many points of a cloud show which frame is the camera's."""
+
 INFO = "info"
 """Place of a loss: a `CameraInfo`. The streams `camera` and so on are places, too."""
 
@@ -275,7 +278,7 @@ class DiscoveryListener:
                 received.image = ReceivedImage(frame.frame_id, frame.image.width, frame.image.height)
                 received.add_name(stream, frame.frame_id)
             case LidarFrame() as frame:
-                received.cloud = frame.frame_id
+                received.cloud, received.points_m = frame.frame_id, frame.xyz_m[:: len(frame.xyz_m) // POINTS + 1]
                 received.add_name(stream, frame.frame_id)
             case EgoMotion() as frame:
                 received.ego = frame.frame_id

@@ -104,6 +104,35 @@ def test_the_frame_of_the_camera_info_leads_to_the_lidar_where_that_of_the_image
     assert missing(pair(), received(image=image, info=replace(INFO, frame_id="nor_this"))) == ["tf_static"]
 
 
+def test_a_namespace_before_the_name_of_a_frame_is_recognised() -> None:
+    reported = received(image=ReceivedImage("/robot/cam", 64, 48), cloud="robot/top", ego="robot/base")
+    result = detected(pair(ego="/odom"), reported)
+    np.testing.assert_allclose(result.pair.T_camera_lidar, T_CAMERA_TOP, rtol=0, atol=1e-12)
+    assert result.origins["T_camera_lidar"] == (
+        "/tf_static, between 'cam' and 'top'; '/robot/cam' is taken for 'cam'; 'robot/top' is taken for 'top'"
+    )
+    assert (result.pair.camera.frame_id, result.pair.lidar.frame_id) == ("/robot/cam", "robot/top")
+    assert change_since(result, pair(ego="/odom"), reported, tree(*VEHICLE)) is None
+    several = tree(VEHICLE[0], ("base", "left/top", np.eye(4)), ("base", "right/top", np.eye(4)))
+    assert missing(pair(), received(), several) == ["tf_static"]
+
+
+def test_the_frame_of_the_camera_info_is_taken_where_the_images_name_the_body() -> None:
+    optical = se3.transform_from(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+    ahead_of_top = np.tile(np.array([[20.0, 0.0, 0.0]], np.float32), (50, 1))
+    mounted = (("base", "body", np.eye(4)), ("body", "cam", optical), ("base", "top", np.eye(4)))
+    reported = received(image=ReceivedImage("body", 64, 48), points_m=ahead_of_top)
+    result = detected(pair(), reported, tree(*mounted))
+    np.testing.assert_allclose(result.pair.T_camera_lidar, se3.inverse(optical), rtol=0, atol=1e-12)
+    assert result.origins["T_camera_lidar"].endswith("that of the CameraInfo, the images name 'body'")
+    assert change_since(result, pair(), reported, tree(*mounted)) is None
+    moved = tree(*mounted[:2], ("base", "top", T_BASE_TOP))
+    assert change_since(result, pair(), reported, moved) is not None
+    # Points above the vehicle are in view of neither, or of the body alone.
+    above = received(image=ReceivedImage("body", 64, 48), points_m=ahead_of_top[:, [1, 2, 0]])
+    np.testing.assert_allclose(detected(pair(), above, tree(*mounted)).pair.T_camera_lidar, np.eye(4), atol=1e-12)
+
+
 def test_a_transform_with_several_values_is_named() -> None:
     transforms = tree(*VEHICLE)
     transforms.add((StaticTransform("base", "top", T_BASE_TOP @ se3.exp(np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.5]))),))

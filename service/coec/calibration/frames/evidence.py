@@ -21,11 +21,9 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.frames.motion_compensation import sensor_twist
 from coec.calibration.types import EgoMotion, LidarFrame, Matrix4
 from coec.geometry import se3
 from coec.geometry.points import lengths
-from coec.geometry.sweep_kernels import deskew
 
 POINTS, NEAR_M, FAR_M = 6000, 2.0, 40.0
 """How many points of a sweep are used, and their ranges: the vehicle itself moves along, far points hardly move."""
@@ -90,6 +88,10 @@ def _unevenness_by_instant(
     sweep: LidarFrame, motion: EgoMotion, T_lidar_ego: Matrix4
 ) -> tuple[float, dict[str, float]]:
     """The unevenness of a sweep with times, as it is, and if its compensation for each instant is undone, radians."""
+    # Imported here because the process that serves has no compiler, and asks only for the rest of this module.
+    from coec.calibration.frames.motion_compensation import sensor_twist
+    from coec.geometry.sweep_kernels import deskew
+
     range_m = lengths(sweep.xyz_m)
     selected = np.flatnonzero((range_m > NEAR_M) & (range_m < FAR_M))
     selected = selected[:: max(1, len(selected) // POINTS)]
@@ -176,6 +178,17 @@ def clouds_in_turn(covered: Sequence[NDArray[np.bool_]]) -> int:
         if np.mean(np.array(turns) >= COVERING * whole) >= AGREEING:
             return count
     return 1
+
+
+IN_VIEW, OUT_OF_VIEW = 0.03, 0.3
+"""Share of a sweep's points that a camera sees at least: one of 60° sees a tenth of a turning LiDAR's. And the ratio of
+the points in view in two frames from which on one of them is not the camera's."""
+
+
+def sees_alone(share: float | None, other: float | None) -> bool:
+    """Whether points of a sweep are in view in one frame, and hardly any in another one, by the shares of them; None:
+    the frame is unknown."""
+    return share is not None and other is not None and share >= IN_VIEW and other < OUT_OF_VIEW * IN_VIEW
 
 
 UNCHANGED_SHARE = 0.8

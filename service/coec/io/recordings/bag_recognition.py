@@ -387,12 +387,6 @@ def as_compensated(sweep: LidarFrame, instant: str) -> LidarFrame:
 
 # --- the rig ----------------------------------------------------------------------------------------------------------
 
-IN_VIEW: Final = 0.03
-"""Share of a sweep's points that a camera sees at least. A 60° camera sees a tenth of a turning LiDAR's."""
-
-OUT_OF_VIEW: Final = 0.3
-"""Ratio of the points in view in two frames from which on one of them is not the camera's."""
-
 
 class IntrinsicsFile(ConfigModel):
     """`intrinsics=FILE`: the head of a `dataset.yaml`, for bags without camera info or without a transform."""
@@ -488,7 +482,8 @@ def _extrinsic(index: BagIndex, pair: PairMessages, lens: _Lens) -> tuple[Matrix
         T_optical = index.transform(optical, lidar_frame)
     if T is None and T_optical is None:
         raise SourceError(f"{index.path}: {unconnected_text(index, named, lidar_frame)}")
-    if T is None or (T_optical is not None and _sees_alone(pair.cloud, lens.camera, T_optical, T)):
+    in_view = [None if pose is None else share_in_image(lens.camera, pose, pair.cloud.xyz_m) for pose in (T_optical, T)]
+    if T is None or evidence.sees_alone(*in_view):
         assert T_optical is not None
         why = "the transforms do not lead there" if T is None else "no points lie in the image there"
         text = (
@@ -503,23 +498,13 @@ def _extrinsic(index: BagIndex, pair: PairMessages, lens: _Lens) -> tuple[Matrix
     return T, recognised
 
 
-def _sees_alone(cloud: LidarFrame, camera: Any, T: Matrix4, T_other: Matrix4) -> bool:
-    """Whether points of a sweep lie in the image at one pose, and hardly any at another one."""
-    share, other = (share_in_image(camera, pose, cloud.xyz_m) for pose in (T, T_other))
-    return share >= IN_VIEW and other < OUT_OF_VIEW * IN_VIEW
-
-
 def known_frame(index: BagIndex, frame_id: str) -> tuple[str, tuple[Recognition, ...]]:
-    """The frame of this name among the transforms; else the only one with the same last part, because a namespace
-    stands before one of the two (`robot/camera`, `camera`)."""
-    name, frames = bare(frame_id), index.transforms.frames
-    if name in frames:
-        return name, ()
-    same = [frame for frame in frames if f"/{frame}".endswith(f"/{name}") or f"/{name}".endswith(f"/{frame}")]
-    if not name or len(same) != 1:
-        return frame_id, ()
-    text = f"The frame {name!a} of the messages is taken for {same[0]!a} of the transforms."
-    return same[0], (Recognition("frame_namespace", text, "warn"),)
+    """The frame of this name among the transforms, see `StaticTransforms.known`, and what to tell of it."""
+    known = index.transforms.known(frame_id)
+    if known == bare(frame_id):
+        return known, ()
+    text = f"The frame {bare(frame_id)!a} of the messages is taken for {known!a} of the transforms."
+    return known, (Recognition("frame_namespace", text, "warn"),)
 
 
 def lidar_frame_of(index: BagIndex, cloud: LidarFrame, requested: str | None) -> tuple[str, Matrix4]:

@@ -145,6 +145,13 @@ class StaticTransforms:
         """All named frames, sorted by name."""
         return tuple(sorted({*self._joints, *(parent for parents in self._joints.values() for parent in parents)}))
 
+    def known(self, frame_id: str) -> str:
+        """The frame of this name; else the only one with the same last part, because a namespace stands before one of
+        the two (`robot/camera`, `camera`); else the name as it is, without a leading slash."""
+        name, frames = bare(frame_id), self.frames
+        same = [frame for frame in frames if f"/{frame}".endswith(f"/{name}") or f"/{name}".endswith(f"/{frame}")]
+        return same[0] if name and name not in frames and len(same) == 1 else name
+
     def refuse(self, refused: Mapping[tuple[str, str], DecodeError]) -> None:
         """Notes transforms that were left out."""
         for names, error in refused.items():
