@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
+from coec.calibration.frames.motion_compensation import sensor_twist
+from coec.calibration.types import EgoMotion, Frame
 from coec.cli.doctor.streams import NAMED, StreamSamples, stream_findings, topic_findings
-from coec.config import IDENTITY, Config
+from coec.config import IDENTITY, Config, PairConfig
+from coec.geometry.sweep_kernels import deskew
 from coec.io.ros.wire_format import Publisher
 from coec.io.zenoh.ros_node import RosTopicList
 from coec.service.ingest.decoder import StreamCounts
+from support.scenes import turning_sweep
 
 IMAGE, POINTS = "sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2"
 LEFT, RIGHT = b"l" * 16, b"r" * 16
@@ -83,3 +89,35 @@ def test_a_silent_stream_is_reported_with_who_is_there_and_two_senders_by_name()
     senders, clock = [one.text for one in result if one.check == "senders"]
     assert senders.startswith("2 publishers send on /front/image at the same time: /left, /right.")
     assert "the clock of the sender stamps them" in clock
+
+
+def test_what_was_recognised_of_messages_is_reported() -> None:
+    config = configured()
+    lidar = StreamSamples("/rear/points", counts=StreamCounts(9, 9, notes=("each cloud covers a part of the turn",)))
+    streams = {"camera": StreamSamples("/front/image"), "lidar": lidar}
+    (result,) = [one for one in stream_findings(config.pairs[0], streams, config, 1.0, THERE) if one.level == "warn"]
+    assert (result.check, result.where) == ("recognised", "/rear/points")
+    assert result.text == "lidar: each cloud covers a part of the turn"
+
+
+@pytest.mark.parametrize("compensated", [True, False])
+def test_sweeps_that_the_driver_compensates_are_reported(compensated: bool) -> None:
+    config = configured()
+    pair = PairConfig.model_validate(config.pairs[0].model_dump() | {"ego": {"topic": "/odom"}})
+    motion = EgoMotion(0, "base", (8.0, 0.0, 0.0), (0.0, 0.0, 0.1))
+    sweeps: list[Frame] = []
+    for number in range(6):
+        sweep = turning_sweep(number)
+        share = np.arctan2(sweep.xyz_m[:, 1], sweep.xyz_m[:, 0]) / (2 * np.pi) + 0.5
+        times_s = share.astype(np.float64) * 0.1
+        xyz_m = deskew(sweep.xyz_m, times_s, *sensor_twist(motion, np.eye(4))) if compensated else sweep.xyz_m
+        sweeps.append(replace(sweep, stamp_ns=number * 10**8, xyz_m=xyz_m, time_offset_s=times_s.astype(np.float32)))
+    motions: list[Frame] = [replace(motion, stamp_ns=number * 10**8) for number in range(6)]
+    streams = {
+        "camera": StreamSamples("/front/image"),
+        "lidar": StreamSamples("/rear/points", first=sweeps),
+        "ego": StreamSamples("/odom", first=motions),
+    }
+    result = [one for one in stream_findings(pair, streams, config, 1.0, THERE) if one.check == "compensation"]
+    assert [one.level for one in result] == (["warn"] if compensated else [])
+    assert not result or "calibration.motion_compensation: false" in str(result[0].advice)

@@ -408,6 +408,11 @@ class OpenEgoConfig(StreamConfig):
     child: str = Field(
         default="base_link", min_length=1, max_length=128, description="frame of the vehicle (TFMessage)"
     )
+    motion: Literal["twist", "pose"] | None = Field(
+        default=None,
+        description="from what of an Odometry the motion is taken: its twist, or differences of its pose; by default "
+        "the twist, unless the poses show that it is not meant as stated",
+    )
 
     @property
     def assumed_type(self) -> EgoMessage:

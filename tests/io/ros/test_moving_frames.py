@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from coec.calibration.types import EgoMotion
 from coec.errors import DecodeError
 from coec.geometry import se3
-from coec.io.ros.transforms import MAX_BETWEEN_S, MAX_TRANSFORMS, MovingFrame
-from support.ros import PoseValues, transforms
+from coec.io.ros.transforms import MAX_BETWEEN_S, MAX_TRANSFORMS, MovingFrame, OdometryMotion
+from support.ros import Packer, PoseValues, transforms
 
 START = 1_700_000_000 * 10**9
 MS = 10**6
@@ -149,3 +149,74 @@ def test_a_hostile_message_of_transforms_is_refused(payload: bytes, reason: str)
     with pytest.raises(DecodeError) as refused:
         MovingFrame("odom", "base_link").motion(payload)
     assert refused.value.reason == reason
+
+
+def odometry(ms: float, stated: NDArray[np.float64], twist: NDArray[np.float64] = TWIST) -> bytes:
+    """An `Odometry` of the drive, with this velocity in it."""
+    packer = Packer().header("odom", *divmod(START + round(ms * MS), 10**9)).text("base_link")
+    packer.put("d", *there(ms, twist), *[0.0] * 36)
+    return packer.put("d", *stated[3:].tolist(), *stated[:3].tolist(), *[0.0] * 36).done()
+
+
+STANDING = np.zeros(6)
+
+
+@pytest.mark.parametrize(
+    ("stated", "reading"),
+    [
+        (STANDING, "are not filled in"),
+        (np.r_[TWIST[:3], -TWIST[3:]], "are backwards"),
+        (np.r_[TWIST[:3], 3.6 * TWIST[3:]], "are in km/h"),
+        (np.r_[np.degrees(TWIST[:3]), TWIST[3:]], "are given with turn rates in degrees"),
+    ],
+)
+@pytest.mark.parametrize("period_ms", [5, 20, 100])
+@pytest.mark.fault(
+    "velocities of an odometry that its poses contradict, on the bus",
+    "the motion is that of the poses, and this is reported",
+)
+def test_an_odometry_whose_velocities_are_not_as_stated(
+    stated: NDArray[np.float64], reading: str, period_ms: int
+) -> None:
+    reader = OdometryMotion(None)
+    motions = [reader.motion(odometry(ms, stated)) for ms in range(0, 6000, period_ms)]
+    assert f"The velocities of the odometry {reading}, by its poses" in reader.note
+    assert "say ego.motion: twist" in reader.note
+    first, last = motions[0], motions[-1]
+    assert first is not None
+    assert first.linear_mps == pytest.approx(tuple(stated[3:]))
+    assert last is not None
+    assert last.linear_mps == pytest.approx(tuple(TWIST[3:]), abs=1e-4)
+    assert last.angular_radps == pytest.approx(tuple(TWIST[:3]), abs=1e-5)
+    assert last.stamp_ns == pytest.approx(START + (6000 - period_ms - max(period_ms, 100) / 2) * MS, abs=2)
+    overridden = OdometryMotion("twist")
+    assert all(overridden.motion(odometry(ms, stated)) is not None for ms in range(0, 6000, period_ms))
+    assert overridden.note == ""
+
+
+def test_an_odometry_that_says_what_its_poses_show() -> None:
+    reader = OdometryMotion(None)
+    for ms in range(0, 60_000, 20):
+        motion = reader.motion(odometry(ms, TWIST))
+        assert motion is not None
+        assert motion.linear_mps == pytest.approx(tuple(TWIST[3:]))
+    standing = OdometryMotion(None)
+    for ms in range(0, 60_000, 100):
+        standing.motion(odometry(ms, STANDING, STANDING))
+    assert (reader.note, standing.note) == ("", "")
+
+
+def test_poses_that_jump_stand_or_step_back_are_no_motion() -> None:
+    reader = OdometryMotion("pose")
+    assert reader.motion(odometry(0, STANDING)) is None
+    assert reader.motion(odometry(900, STANDING)) is None, "a gap"
+    assert reader.motion(odometry(1000, STANDING)) is not None
+    assert reader.motion(odometry(500, STANDING)) is None, "another clock"
+    with pytest.raises(DecodeError):
+        reader.motion(odometry(600, STANDING, 1e4 * TWIST))
+    contradicted = OdometryMotion(None)
+    for ms in range(0, 6000, 20):
+        motion = contradicted.motion(odometry(ms, 0.4 * TWIST))
+        assert motion is not None
+        assert motion.linear_mps == pytest.approx(tuple(0.4 * TWIST[3:]))
+    assert "say ego.motion: pose" in contradicted.note

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from coec.calibration.frames.evidence import MOST_CLOUDS
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, Frame, ImageFormat, LidarFrame
 from coec.config import (
@@ -30,7 +31,7 @@ from coec.io.zenoh.ros_node import RosTopicList
 from coec.service.api.problems import stream_problems
 from coec.service.ingest.decoder import CAMERA, EGO, LIDAR, RECENT, Decoder, SensorStream
 from coec.service.ingest.inbox import Inbox, Parcel, Posted
-from support.ros import packed_cloud, transforms
+from support.ros import Packer, packed_cloud, transforms
 from support.scenes import ROOF_POSE, sweep_in_frame, turning_sweep
 
 MSGPACK, CDR = "application/msgpack", "application/cdr"
@@ -219,6 +220,36 @@ def test_ring_numbers_that_are_no_scan_lines_are_left_out_and_the_log_says_so_on
     frame = Bench().take(LIDAR, packed_cloud([*columns, ("ring", "<u2", sweep.ring[:2000].tolist())]), CDR)
     assert isinstance(frame, LidarFrame)
     assert frame.ring is not None
+
+
+def test_clouds_that_are_parts_of_a_turn_are_named(bench: Bench) -> None:
+    def frames_of(bench: Bench, parts: int) -> tuple[str, ...]:
+        for number in range(MOST_CLOUDS):
+            sweep = turning_sweep(number // parts)
+            share = np.arctan2(sweep.xyz_m[:, 1], sweep.xyz_m[:, 0]) / (2 * np.pi) + 0.5
+            part = sweep.xyz_m[np.floor(share * parts).clip(0, parts - 1) == number % parts]
+            cloud = LidarFrame(5 + number, "lidar", np.ascontiguousarray(part))
+            assert bench.take(LIDAR, msgpack_frames.encode_lidar(cloud), MSGPACK) is not None
+        return bench.decoders[LIDAR].counts().notes
+
+    (note,) = frames_of(bench, 8)
+    assert "each cloud covers a part of the turn, 8 in a row the whole" in note
+    assert frames_of(Bench(), 1) == ()
+
+
+def test_an_odometry_without_velocities_gives_the_motion_of_its_poses(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    motion: object = None
+    for number in range(700):
+        packer = Packer().header("odom", 1 + number // 200, number % 200 * 5_000_000).text("base")
+        packer.put("d", 0.04 * number, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, *[0.0] * (36 + 6 + 36))
+        motion = bench.take(EGO, packer.done(), CDR)
+    assert isinstance(motion, EgoMotion)
+    assert motion.linear_mps == pytest.approx((8.0, 0.0, 0.0))
+    assert caplog.text.count("are not filled in, by its poses") == 1
+    (note,) = bench.decoders[EGO].counts().notes
+    assert "ego.motion: twist" in note
 
 
 def test_a_type_that_people_take_for_the_right_one_is_distinguished(

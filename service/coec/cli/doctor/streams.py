@@ -15,9 +15,11 @@ from typing import get_args
 import numpy as np
 import zenoh
 
-from coec.calibration.types import NS_PER_S, CameraFrame, Frame, LidarFrame
+from coec.calibration.frames.evidence import compensated_for
+from coec.calibration.frames.pairing import motion_at
+from coec.calibration.types import NS_PER_S, CameraFrame, EgoMotion, Frame, LidarFrame
 from coec.cli.doctor.environment import cause_of_silence, fail, ok, warn
-from coec.config import CameraMessage, Config, EgoMessage, LidarMessage, PacketMessage, PairConfig
+from coec.config import IDENTITY, CameraMessage, Config, EgoMessage, LidarMessage, PacketMessage, PairConfig
 from coec.errors import DecodeError
 from coec.io.depth.depth_maps import STEREO
 from coec.io.images import Inspector
@@ -35,6 +37,9 @@ SAMPLES_WAITING = 8
 """Most samples of a stream that wait to be decoded; further ones are only counted."""
 
 MOTIONS_WAITING = 512
+
+SWEEPS = 6
+"""Sweeps in which a compensation of the driver is looked for."""
 
 SAMPLES_COUNTED = 200_000
 """Most samples of a stream whose arrival and size are noted: a minute at 3 kHz. A flood beyond that is not counted."""
@@ -80,6 +85,7 @@ class StreamSamples:
         stamps: sensor time of each frame, and the wall clock when its sample arrived, ns, in the order of arrival.
         refused: samples that made no frame, by reason.
         latest: the last frame.
+        first: the first sweeps; of ego-motion, the first `MOTIONS_WAITING`.
         counts: counts of the senders, at the end.
         elsewhere: number of samples that a client of the same router got.
     """
@@ -91,6 +97,7 @@ class StreamSamples:
     stamps: list[tuple[int, int]] = field(default_factory=list)
     refused: Counter[str] = field(default_factory=Counter)
     latest: Frame | None = None
+    first: list[Frame] = field(default_factory=list)
     counts: StreamCounts | None = None
     elsewhere: int = 0
 
@@ -225,6 +232,8 @@ class _PairSubscription:
             samples = self.samples[name]
             if frame is not None:
                 samples.latest = frame
+                if len(samples.first) < {LIDAR: SWEEPS, EGO: MOTIONS_WAITING}.get(name, 0):
+                    samples.first.append(frame)
                 samples.stamps.append((frame.stamp_ns, wall_ns))
             samples.refused = Counter(
                 {
@@ -258,11 +267,16 @@ def stream_findings(
     counts = {name: one.counts for name, one in streams.items() if one.counts is not None}
     for reason in stream_problems(counts, pair, topics):
         yield warn("senders", pair.name, reason.text, PROBLEMS[reason.code].advice)
+    for name, of_stream in counts.items():
+        for text in of_stream.notes:
+            yield warn("recognised", streams[name].place, f"{name}: {text}", "see that it is so; docs/recordings.md")
     camera, lidar, ego = streams[CAMERA], streams[LIDAR], streams.get(EGO)
     if camera.stamps and lidar.stamps:
         yield _in_step(pair, camera.stamps, lidar.stamps)
     if camera.stamps and ego is not None and ego.stamps:
         yield _with_motion(pair, camera.stamps, ego.stamps)
+    if ego is not None and pair.calibration.motion_compensation:
+        yield from _compensated(pair, lidar.first, ego.first)
     if isinstance(lidar.latest, LidarFrame):
         yield _point_times(pair, lidar.latest, None if pair.lidar.has_packets else lidar.rate_hz)
     if isinstance(camera.latest, CameraFrame):
@@ -405,6 +419,22 @@ def _with_motion(pair: PairConfig, camera: Sequence[tuple[int, int]], ego: Seque
         advice = "put both on one clock; without ego-motion sweeps are not compensated, and standing is not seen"
         return warn("in_step", pair.name, text, advice)
     return ok("in_step", pair.name, text)
+
+
+def _compensated(pair: PairConfig, sweeps: Sequence[Frame], motions: Sequence[Frame]) -> Iterator[Finding]:
+    """The finding on sweeps that the driver has compensated for motion; none while the vehicle stands."""
+    known = [one for one in motions if isinstance(one, EgoMotion)]
+    moving = []
+    for sweep in sweeps:
+        motion = motion_at(known, sweep.stamp_ns, round(pair.pairing.motion_tolerance_s * NS_PER_S))
+        if isinstance(sweep, LidarFrame) and motion is not None:
+            moving.append((sweep, motion))
+    T_lidar_ego = np.array(pair.ego.T_lidar_ego if pair.ego is not None else IDENTITY, np.float64)
+    instant = compensated_for(moving, T_lidar_ego)
+    if instant is not None:
+        text = f"the points are compensated for motion already, for the {instant} of each sweep"
+        advice = "let the driver publish raw points, or set calibration.motion_compensation: false"
+        yield warn("compensation", pair.lidar.place, text, advice)
 
 
 def _point_times(pair: PairConfig, cloud: LidarFrame, rate_hz: float | None) -> Finding:

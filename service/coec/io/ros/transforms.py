@@ -1,5 +1,5 @@
 """Transforms of ROS 2 (`tf2_msgs/TFMessage`), read with bounds: the tree of static transforms, and ego-motion from two
-poses of a moving frame.
+poses of a moving frame, also of an `Odometry` whose velocity is not what its poses show.
 
 In tf each frame has one parent, and the latest transform of a joint holds. Names, positions and the number of joints
 are bounded before anything is kept. Trees that violate tf's rule, and joints that change, are reported, so that the
@@ -14,17 +14,18 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from rosbags.typesys.stores import ros2_humble as ros
 
+from coec.calibration.frames import evidence
 from coec.calibration.types import EgoMotion, Matrix4
 from coec.errors import DecodeError
 from coec.geometry import se3
 from coec.geometry.se3 import inverse, rotation_from_quaternion_xyzw, transform_from
 from coec.io.frame_validation import MAX_FRAME_ID, Refusal
-from coec.io.ros.message_decoding import check_motion, checked
+from coec.io.ros.message_decoding import check_motion, checked, odometry
 from coec.io.ros.messages import MessageCursor, deserialized, frame_id, stamp_ns
 
 MAX_TRANSFORMS: Final = 2048
@@ -334,6 +335,87 @@ class MovingFrame:
         wx, wy, wz, vx, vy, vz = (float(v) for v in twist)
         middle_ns = before.stamp_ns + (pose.stamp_ns - before.stamp_ns) // 2
         return checked(middle_ns, frame_id(self._child), (vx, vy, vz), (wx, wy, wz))
+
+
+COMPARED_EVERY_S: Final = 0.5
+"""Time from one comparison of the velocities of an odometry with its poses to the next, s."""
+
+COMPARED: Final = 40
+"""Latest comparisons that count: those of 20 s."""
+
+
+class OdometryMotion:
+    """The motion in `Odometry`, from message to message: its velocity; or the difference of its poses, once these have
+    shown that the velocity is not meant as stated. Not safe for use from several threads.
+
+    Attributes:
+        note: what was recognised, and what to configure if that is wrong; empty: nothing.
+    """
+
+    def __init__(self, source: Literal["twist", "pose"] | None) -> None:
+        """`source`: from what the motion is taken; None: it is recognised."""
+        self.note = ""
+        self._source = source
+        self._is_open, self._opened_ns = False, -(2**62)
+        self._compared: deque[evidence.PoseAndTwist] = deque(maxlen=2 * COMPARED)
+        self._recent: deque[evidence.PoseAndTwist] = deque()
+
+    def motion(self, payload: bytes) -> EgoMotion | None:
+        """The motion, from an `Odometry` in CDR; None: there was no earlier pose, or no vehicle moves like that.
+
+        Raises:
+            DecodeError: not this message.
+        """
+        stated = odometry(payload)
+        if self._source == "pose":
+            return self._by_poses(evidence.PoseAndTwist(odometry_pose(payload), stated))
+        if self._source is None and self._is_compared(stated.stamp_ns):
+            self._compared.append(evidence.PoseAndTwist(odometry_pose(payload), stated))
+            self._recognise()
+        return stated
+
+    def _is_compared(self, now_ns: int) -> bool:
+        """Whether a message is the first or the second one of a comparison."""
+        since_s = (now_ns - self._opened_ns) * 1e-9
+        if self._is_open and evidence.LEAST_S <= since_s <= evidence.MOST_S:
+            self._is_open = False
+            return True
+        if 0.0 <= since_s < COMPARED_EVERY_S:
+            return False
+        if since_s < 0.0:
+            self._compared.clear()
+        self._is_open, self._opened_ns = True, now_ns
+        return True
+
+    def _recognise(self) -> None:
+        reading = evidence.reading_of_twists(tuple(self._compared))
+        if reading is evidence.TwistReading.CONTRADICTED:
+            self.note = (
+                "The velocities of the odometry do not fit its poses; the velocities are used. If the poses are right, "
+                "say ego.motion: pose."
+            )
+        elif reading is not evidence.TwistReading.AS_STATED:
+            # It stays so: a vehicle that stands shows nothing.
+            self._source = "pose"
+            self.note = (
+                f"The velocities of the odometry are {reading}, by its poses: the motion is taken from the differences "
+                "of the poses. If the velocities are right, say ego.motion: twist."
+            )
+
+    def _by_poses(self, message: evidence.PoseAndTwist) -> EgoMotion | None:
+        """The motion since the latest pose that is `evidence.LEAST_S` earlier."""
+        if message.T_parent_child is None:
+            return None
+        recent = self._recent
+        if recent and recent[-1].stamp_ns >= message.stamp_ns:
+            recent.clear()
+        recent.append(message)
+        while len(recent) > 2 and message.stamp_ns - recent[1].stamp_ns >= evidence.LEAST_S * 1e9:
+            recent.popleft()
+        for motion in evidence.motions_of_poses((recent[0], message)):
+            assert motion.linear_mps is not None
+            return checked(motion.stamp_ns, motion.frame_id, motion.linear_mps, motion.angular_radps)
+        return None
 
 
 def frames_in(payload: bytes) -> set[tuple[str, str]]:

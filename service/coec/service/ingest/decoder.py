@@ -20,8 +20,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from coec.calibration.frames import lidar_origin
+from coec.calibration.frames import evidence, lidar_origin
 from coec.calibration.types import NS_PER_S, CameraFrame, EgoMotion, Frame, LidarFrame
 from coec.config import (
     IDENTITY,
@@ -40,7 +41,7 @@ from coec.io.frame_validation import Refusal
 from coec.io.logs import LossCounter
 from coec.io.ros import message_decoding, messages, packet_streams
 from coec.io.ros.packet_streams import PacketAssembler, PacketSensor
-from coec.io.ros.transforms import MovingFrame
+from coec.io.ros.transforms import MovingFrame, OdometryMotion
 from coec.io.ros.wire_format import MessageAttachment
 from coec.io.zenoh.bus import CDR, InputSample
 from coec.service.timing import QUICK_S, Histogram
@@ -300,6 +301,11 @@ TWO_SENDERS = "two_senders"
 """Cause of a loss: several senders send on the stream at the same time, and nobody knows whose frames are the
 sensor's."""
 
+ONE_RING = (
+    "the field `ring` of the clouds holds one number: it is ignored, beams are told apart by their elevation; check "
+    "the driver of the LiDAR"
+)
+
 OTHERS = frozenset({"frame_id", "image_size"})
 """Causes of the refusal of frames that are another sensor's, or of a sensor with other settings."""
 
@@ -314,6 +320,7 @@ class StreamCounts:
         foreign: whether frames of `OTHERS` come beside the stream's own.
         stamped_by_sender: the latest frame came without a stamp and got the time at which it was sent, by the sender's
             clock.
+        notes: what was recognised of the messages, which their fields do not state.
     """
 
     received: int
@@ -321,6 +328,7 @@ class StreamCounts:
     taking_turns: tuple[bytes, ...] = ()
     foreign: bool = False
     stamped_by_sender: bool = False
+    notes: tuple[str, ...] = ()
 
 
 class SampleReader:
@@ -335,7 +343,9 @@ class SampleReader:
         self._kind = kind
         self._stream = stream
         self._limits = limits
-        self._moving = MovingFrame(stream.parent, stream.child) if isinstance(stream, OpenEgoConfig) else None
+        ego = stream if isinstance(stream, OpenEgoConfig) else None
+        self._moving = None if ego is None else MovingFrame(ego.parent, ego.child)
+        self._odometry = None if ego is None else OdometryMotion(ego.motion)
         self.packets: PacketAssembler | None = None
         self._descriptions: deque[bytes] = deque(maxlen=2)
         self._named: PacketSensor | None = None
@@ -369,6 +379,8 @@ class SampleReader:
                 return self._sweep(type_name, sample, lidar.metadata)
             if type_name == messages.TF and self._moving is not None:
                 return self._moving.motion(sample.payload)
+            if type_name == messages.ODOMETRY and self._odometry is not None:
+                return self._odometry.motion(sample.payload)
             time, source = (None, None) if lidar is None else (lidar.time, lidar.source)
             return message_decoding.decode(type_name, sample.payload, self._limits, point_time=time, source=source)
         if self._kind == CAMERA:
@@ -376,6 +388,11 @@ class SampleReader:
         if self._kind == LIDAR:
             return msgpack_frames.decode_lidar(sample.payload, self._limits)
         return msgpack_frames.decode_ego(sample.payload, self._limits)
+
+    @property
+    def note(self) -> str:
+        """What was recognised of an odometry; empty: nothing."""
+        return "" if self._odometry is None else self._odometry.note
 
     def _describe(self, text: bytes) -> None:
         if packet_streams.is_description(text) and len(text) <= packet_streams.MAX_DESCRIPTION_BYTES:
@@ -437,7 +454,9 @@ class Decoder:
         )
         self._origin = lidar_origin.OriginCheck()
         self._checked_period: int | None = None
-        self._contradicted = self._ring_reported = False
+        self._contradicted = False
+        self._notes: tuple[str, ...] = ()
+        self._covered: list[NDArray[np.bool_]] | None = []
         self._ordered = True
         self.timed_by = ""
 
@@ -446,7 +465,13 @@ class Decoder:
         own = tuple(self._own)
         foreign = any(own) and not all(own)
         turns = self._senders.taking_turns
-        return StreamCounts(self._received, self._accepted, turns, foreign, self._stamped_by_sender)
+        return StreamCounts(self._received, self._accepted, turns, foreign, self._stamped_by_sender, self._notes)
+
+    def _note(self, text: str) -> None:
+        """Logs what was recognised, once."""
+        if text and text not in self._notes:
+            self._notes = (*self._notes, text)
+            _log.warning(text, extra={"fields": {"sensor": self._stream.sensor}})
 
     @property
     def on_trial(self) -> bool:
@@ -478,6 +503,7 @@ class Decoder:
             if len(sample.payload) > self._limits.max_message_bytes:
                 raise DecodeError("message_too_large", "larger than limits.max_message_bytes")
             frame = self._samples.frame(sample)
+            self._note(self._samples.note)
             if frame is None:
                 return None
             self._check_times(frame)
@@ -560,12 +586,28 @@ class Decoder:
         if cloud.frame_id != (lidar.cloud_frame_id or lidar.frame_id):
             raise DecodeError("frame_id", "differs from the frame id in the configuration")
         sweep = cloud
+        if self._covered is not None and not was_read:
+            self._compare_sectors(cloud, self._covered)
         if not self._is_own_frame:
             sweep = lidar_origin.from_origin(cloud, self._T_cloud_lidar, lidar.frame_id)
         contradiction = None if was_read else self._contradiction(sweep)
         if contradiction is not None:
             raise DecodeError(contradiction.cause, f"{contradiction.sentence} See lidar.{contradiction.setting}.")
         return sweep if self._ordered else lidar_origin.unordered(sweep)
+
+    def _compare_sectors(self, cloud: LidarFrame, covered: list[NDArray[np.bool_]]) -> None:
+        """Whether the first clouds of a stream are parts of a turn; one that covers a whole turn ends the question."""
+        covered.append(evidence.sectors(cloud))
+        whole = covered[-1].sum() >= evidence.WHOLE * evidence.SECTORS
+        if not whole and len(covered) < evidence.MOST_CLOUDS:
+            return
+        self._covered = None
+        in_turn = 1 if whole else evidence.clouds_in_turn(covered)
+        if in_turn > 1:
+            self._note(
+                f"each cloud covers a part of the turn, {in_turn} in a row the whole, and each is taken as a sweep: "
+                "let the driver send whole turns (Velodyne: npackets, rpm, cut_angle)"
+            )
 
     def _contradiction(self, sweep: LidarFrame) -> lidar_origin.ApparentOrigin | lidar_origin.SeveralOrigins | None:
         """What in a sweep contradicts the configured origin; None: nothing. Also notes whether rings are scan lines.
@@ -574,18 +616,12 @@ class Decoder:
         if period == self._checked_period and not self._contradicted:
             return None
         self._checked_period = period
-        if sweep.ring is not None and distinct_rings(sweep.ring) is None and not self._ring_reported:
-            self._ring_reported = True
-            _log.warning(
-                "the field `ring` of the clouds holds one number: it is ignored, beams are told apart by their "
-                "elevation; check the driver of the LiDAR",
-                extra={"fields": {"sensor": self._stream.sensor}},
-            )
+        if sweep.ring is not None and distinct_rings(sweep.ring) is None:
+            self._note(ONE_RING)
         contradiction = self._origin.inspect(sweep)
         self._ordered = self._origin.has_scan_lines(sweep)
-        if not self._ordered and not self._ring_reported:
-            self._ring_reported = True
-            _log.warning(lidar_origin.NO_SCAN_LINES.text, extra={"fields": {"sensor": self._stream.sensor}})
+        if not self._ordered and ONE_RING not in self._notes:
+            self._note(lidar_origin.NO_SCAN_LINES.text)
         self._contradicted = contradiction is not None
         return contradiction
 
