@@ -115,7 +115,7 @@ SELECTED: Mapping[str, tuple[Selected, ...]] = {
         ),
         Selected(
             "steps in traffic, frozen sensors, wrong odometry, turned or loose mounts, another lens",
-            "`healthy` for at most three periods while the extrinsic is wrong",
+            "`healthy` until the third check is answered at most while the extrinsic is wrong",
             "steps at a standstill and in traffic, stuck odometry, frozen sensors, turned and loose mounts, "
             "another lens",
         ),
