@@ -224,6 +224,9 @@ class _Search:
             sizes = f"{image.width} x {image.height} px, the CameraInfo on {topic} is for {size.width} x {size.height}"
             raise _MissingError(Reason("camera_info_size", f"Images on {pair.camera.place} are {sizes} px."))
         self.origins[INTRINSICS] = f"CameraInfo on {topic}: {lens.source}"
+        of_lens = received.info.frame_id
+        if image is not None and self._transforms.known(of_lens) != self._transforms.known(image.frame_id):
+            self.origins[INTRINSICS] += f"; of the frame {_named(of_lens)}, the images name {_named(image.frame_id)}"
         return lens.intrinsics
 
     def camera_frame(self) -> str | None:

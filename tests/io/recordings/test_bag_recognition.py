@@ -161,6 +161,10 @@ def test_clouds_of_two_lidars_on_one_topic_are_reported(tmp_path: Path) -> None:
         message.header = first.header
     assert codes(opened(tmp_path, [*ELSE, *odometry(), *turns(), *second])) == ["several_lidars"]
     assert codes(opened(tmp_path, [*ELSE, *odometry(), *turns(), *turns()])) == [], "each cloud twice"
+    sparse = [(topic, cloud_at(message, k * SECOND)) for k, (topic, message) in enumerate(turns())]
+    later = [(topic, cloud_at(message, k * SECOND + 20 * MS)) for k, (topic, message) in enumerate(turns())]
+    assert codes(opened(tmp_path, [*ELSE, *odometry(), *sparse])) == []
+    assert codes(opened(tmp_path, [*ELSE, *odometry(), *sparse, *later])) == ["several_lidars"]
     # Two halves without times are either.
     assert codes(opened(tmp_path, [*ELSE, *odometry(), *turns(2, timed=False)])) == ["several_lidars"]
 

@@ -197,6 +197,23 @@ def test_of_two_cameras_infos_on_a_topic_that_of_the_images_is_taken(tmp_path: P
     assert recording.rig.camera.fx == 50.0
 
 
+def test_a_camera_info_of_another_camera_is_named(tmp_path: Path) -> None:
+    def codes_of(frame: str, tree: list[Any], query: str = "") -> set[str]:
+        infos_of_frame = [*infos(lens(50.0, frame)), *without_info()]
+        messages = [(topic, one) for topic, one in infos_of_frame if topic != "/tf_static"]
+        transforms = ("/tf_static", ros.tf2_msgs__msg__TFMessage(tree))
+        return set(recognitions(opened([transforms, *messages], tmp_path, query)))
+
+    body = transform_message("optical", "body", se3.exp(np.array([1.2, 0.0, 0.0, 0.0, 0.05, 0.0])))
+    rear = transform_message("base", "rear", se3.exp(np.array([0.0, 0.0, 3.0, -1.0, 0.0, 1.0])))
+    assert codes_of("optical", TREE) == set()
+    assert codes_of("body", [*TREE, body]) == set()
+    assert codes_of("robot/optical", TREE) == set()
+    assert codes_of("rear", [*TREE, rear]) == {"camera_info_frame"}
+    assert codes_of("rear", TREE) == {"camera_info_frame"}
+    assert codes_of("rear", TREE, f"?intrinsics={INFO}") == set()
+
+
 def test_camera_infos_without_end_are_few_in_memory(tmp_path: Path) -> None:
     many = infos(*(lens(50.0 + 1e-6 * number) for number in range(2 * MAX_CONTENTS)))
     recording = opened([*many, *without_info()], tmp_path)

@@ -101,6 +101,7 @@ def test_the_frame_of_the_camera_info_leads_to_the_lidar_where_that_of_the_image
     assert result.origins["T_camera_lidar"] == (
         "/tf_static, between 'cam' and 'top'; the frame is that of the CameraInfo, the images name 'no_such_frame'"
     )
+    assert "of the frame 'cam', the images name 'no_such_frame'" in result.origins["camera.intrinsics"]
     assert missing(pair(), received(image=image, info=replace(INFO, frame_id="nor_this"))) == ["tf_static"]
 
 

@@ -54,6 +54,11 @@ FEW_CLOUDS: Final = 5
 OVERLAPPING: Final = 1.3
 """Parts of one turn last no longer than so many times their distance; clouds of two LiDARs overlap in time."""
 
+OVERLAPPING_SHARE, SHORTER = 0.4, 1.8
+"""Two LiDARs that come in turn have half of their intervals shorter than a cloud lasts, also where a recording has
+gaps: at least the first share of them, by at least the second factor. Stamps of one that scatter by a fifth of a sweep
+have one in twenty."""
+
 TWIST_CONTRADICTED: Final = "twist_contradicted"
 """Code of the recognition that velocities and poses of an odometry fit in no way."""
 
@@ -303,7 +308,10 @@ def _overlap(clouds: Sequence[LidarFrame]) -> bool:
     stamps_ns = sorted({cloud.stamp_ns for cloud in clouds})
     if not timed or len(stamps_ns) < FEW_CLOUDS:
         return False
-    return float(np.median(timed)) > OVERLAPPING * float(np.median(np.diff(stamps_ns))) * 1e-9
+    intervals_s, lasts_s = 1e-9 * np.diff(stamps_ns), float(np.median(timed))
+    # Of a recording with gaps, those between the clouds of one instant count.
+    in_gaps = float((SHORTER * intervals_s < lasts_s).mean())
+    return lasts_s > OVERLAPPING * float(np.median(intervals_s)) or in_gaps >= OVERLAPPING_SHARE
 
 
 def _turning(seen: Sequence[LidarFrame]) -> bool:
@@ -491,11 +499,29 @@ def _extrinsic(index: BagIndex, pair: PairMessages, lens: _Lens) -> tuple[Matrix
             f"{why}. ?camera_frame=NAME says otherwise."
         )
         recognised, named, T = (Recognition("camera_frame", text, "warn"),), optical, T_optical
+    elif optical and pair.intrinsics is None and _is_elsewhere(index, optical, named):
+        text = (
+            f"The CameraInfo names the frame {optical!a}, the images {pair.image.frame_id!a}: it may be that of "
+            "another camera. ?intrinsics=/TOPIC or FILE states the right one."
+        )
+        recognised = (*recognised, Recognition("camera_info_frame", text, "warn"))
     changes = index.transforms.changes(named, lidar_frame)
     if changes:
         text = f"/tf_static: {'; '.join(changes)}. ?intrinsics=FILE with `T_camera_lidar:` gives another."
         recognised = (*recognised, Recognition("transform_changes", text, "warn"))
     return T, recognised
+
+
+SAME_PLACE_M: Final = 0.1
+"""Frames of one camera, its body and its lens, are at most so far from each other."""
+
+
+def _is_elsewhere(index: BagIndex, optical: str, named: str) -> bool:
+    """Whether two frames are not those of one camera, by their names and transforms."""
+    if bare(optical) == bare(named) or index.transforms.known(optical) == index.transforms.known(named):
+        return False
+    T = index.transform(named, optical)
+    return T is None or float(np.linalg.norm(T[:3, 3])) > SAME_PLACE_M
 
 
 def known_frame(index: BagIndex, frame_id: str) -> tuple[str, tuple[Recognition, ...]]:
