@@ -271,7 +271,8 @@ def _measured_offset(
     text = (
         f"the stamps of the camera are {1e3 * abs(offset.offset_s):.0f} ± {1e3 * offset.sigma_s:.0f} ms {late} than "
         f"its exposures by the clock of the LiDAR, {cause}: correct the stamps in the driver and record again; "
-        f"of a bag, ?camera_offset={offset.offset_s:.4f} is added to the stamps of the camera"
+        f"of a bag, ?camera_offset={offset.offset_s:.4f} is added to the stamps of the camera (in a dataset.yaml, "
+        "add it to each stamp_ns)"
     )
     if not offset.observable:
         speeds_mps = [pair.motion.speed_mps or 0.0 for pair in window.pairs if pair.motion is not None]
@@ -295,7 +296,7 @@ def stamped_text(sweep: calibration.LidarFrame, offset_s: float, sigma_s: float)
         if min(abs(begin_s), abs(end_s)) < 0.1 * lasts_s and away_s < min(3.0 * sigma_s, 0.2 * lasts_s):
             return (
                 f"which is {part} sweep: the times of points count from its {counted[0]}, and its stamp is probably "
-                f"that of its {place} (?lidar_offset={-share * counted[2]:.4f})"
+                f"that of its {place} (?lidar_offset={-share * counted[2]:.4f}; in a dataset.yaml, cloud_stamp_ns)"
             )
     return "as of images that are stamped when they are received, or sweeps that are stamped at another point"
 

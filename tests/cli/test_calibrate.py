@@ -21,6 +21,7 @@ from coec.io.depth.depth_maps import open_depth
 from coec.io.images import encode_png
 from coec.io.recordings.recording_source import evenly_spread
 from coec.io.recordings.window_cutting import parse_perturbation
+from coec.reports.calibration import remarks
 from golden.scene import Drive, write
 
 TOLERANCE_DEG = 0.35
@@ -211,6 +212,19 @@ def test_time_offset_is_reported_on_request(coec: Coec) -> None:
     assert requested["reason"]
     assert "camera after its stamp" in coec(*arguments, "--time-offset").out
     assert "time_offset" not in coec(*arguments, "--json").document
+
+
+@pytest.mark.parametrize(
+    ("offset_s", "text"),
+    [
+        (-0.0304, "not observable, a straight drive; the best fit is -30.4 ± 4.5 ms"),
+        (None, "not observable, a straight drive"),
+    ],
+)
+def test_an_offset_that_is_not_observable_is_reported_with_its_size(offset_s: float | None, text: str) -> None:
+    offset = {"observable": False, "reason": "a straight drive", "offset_s": offset_s, "sigma_s": 0.0045}
+    document = {"recognitions": [], "weighed": None, "time_offset": offset}
+    assert remarks(document) == [f"camera after its stamp: {text}"]
 
 
 def test_without_a_network_the_one_that_comes_with_coec_is_used(coec: Coec) -> None:

@@ -202,9 +202,11 @@ def _cues_table(cues: Mapping[str, Cue]) -> Table:
 
 
 def _offset_text(offset: Mapping[str, Any]) -> str:
-    if not offset["observable"]:
-        return f"not observable, {offset['reason']}"
-    return f"{1e3 * offset['offset_s']:+.1f} ± {1e3 * offset['sigma_s']:.1f} ms, {offset['reason']}"
+    offset_s, sigma_s = offset["offset_s"], offset["sigma_s"]
+    fitted = f"{1e3 * offset_s:+.1f} ± {1e3 * sigma_s:.1f} ms" if None not in (offset_s, sigma_s) else ""
+    if offset["observable"]:
+        return f"{fitted}, {offset['reason']}"
+    return f"not observable, {offset['reason']}" + (f"; the best fit is {fitted}" if fitted else "")
 
 
 USE = (
