@@ -223,7 +223,7 @@ def test_time_offset_is_reported_on_request(coec: Coec) -> None:
 )
 def test_an_offset_that_is_not_observable_is_reported_with_its_size(offset_s: float | None, text: str) -> None:
     offset = {"observable": False, "reason": "a straight drive", "offset_s": offset_s, "sigma_s": 0.0045}
-    document = {"recognitions": [], "weighed": None, "time_offset": offset}
+    document: dict[str, Any] = {"recognitions": [], "weighed": None, "time_offset": offset}
     assert remarks(document) == [f"camera after its stamp: {text}"]
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from coec.calibration.types import Reason
 from coec.config import OpenPairConfig
 from coec.geometry import se3
 from coec.io.ros.camera_info import CameraInfoContent
@@ -116,6 +117,8 @@ def test_a_namespace_before_the_name_of_a_frame_is_recognised() -> None:
     assert change_since(result, pair(ego="/odom"), reported, tree(*VEHICLE)) is None
     several = tree(VEHICLE[0], ("base", "left/top", np.eye(4)), ("base", "right/top", np.eye(4)))
     assert missing(pair(), received(), several) == ["tf_static"]
+    (reason,) = cast("tuple[Reason, ...]", discover(pair(), received(), several))
+    assert reason.text.endswith("or set T_camera_lidar.")
 
 
 def test_the_frame_of_the_camera_info_is_taken_where_the_images_name_the_body() -> None:
