@@ -323,8 +323,8 @@ class _Search:
         if T_target_source is None:
             there = _listed(self._transforms.frames)
             text = (
-                f"{TF_STATIC} does not connect {names} (for {place}): {there}.{_left_out(self._transforms)} Publish the "
-                f"missing transform on it (one on /tf may move, and is not taken), or set {place}."
+                f"{TF_STATIC} does not connect {names} (for {place}): {there}.{_left_out(self._transforms)} Publish "
+                f"the missing transform on it (one on /tf may move, and is not taken), or set {place}."
             )
             raise _MissingError(Reason("tf_static", text))
         doubts = self._transforms.doubts(target, source)
