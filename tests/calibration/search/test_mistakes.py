@@ -137,6 +137,31 @@ def test_a_wrong_pose_is_named_and_corrected(few: Window, code: str) -> None:
     assert mistakes.KINDS[code].advice in mistake.text
 
 
+def of_held_centre(window: Window, T_camera_lidar: NDArray[np.float64]) -> Mistake | None:
+    """What is named if a pose is given and a search of rotations ends there."""
+    rig = replace(window.rig, T_camera_lidar_nominal=T_camera_lidar)
+    moved = replace(window, rig=rig, T_camera_lidar_start=T_camera_lidar)
+    data = WindowData(moved, True, DEPTH, EditedImages(), CallbackProgress(None))
+    return probable_mistake(data, T_camera_lidar)
+
+
+def test_a_wrong_translation_that_was_held_is_named_with_the_one_that_fits(few: Window) -> None:
+    right = few.rig.T_camera_lidar_nominal
+    aside = of_held_centre(few, se3.perturb(right, np.array([0.01, 0.0, 0.0, 0.6, -0.2, 0.0])))
+    assert aside is not None
+    assert (aside.code, aside.correctable) == (mistakes.TRANSLATION, False)
+    assert "right +0.6" in aside.text
+    centre = se3.transform_from(right[:3, :3], se3.inverse(right)[:3, 3])
+    read = of_held_centre(few, centre)
+    assert read is not None
+    assert read.code == mistakes.INVERSE_TRANSLATION
+
+
+def test_a_shift_along_the_way_of_a_vehicle_is_not_said_of_its_mount(few: Window) -> None:
+    ahead = of_held_centre(few, se3.perturb(few.rig.T_camera_lidar_nominal, np.array([0, 0, 0, 0, 0, 0.8])))
+    assert ahead is None or ahead.code != mistakes.TRANSLATION
+
+
 def test_a_crop_that_is_missing_in_the_principal_point_is_named(few: Window) -> None:
     right = approximate(few.rig)
     cut_px = right.camera.width // 8

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.frames.evidence import are_raw, compensated_for, upright_axes
+from coec.calibration.frames.motion_compensation import sensor_twist
 from coec.calibration.objective import edges as cue
 from coec.calibration.objective.mutual_information import SearchBox
 from coec.calibration.search.global_search import sample_reach
@@ -43,6 +44,7 @@ from coec.calibration.search.mistakes import (
     OTHER_AXES,
     QUARTER_TURN,
     RECTIFIED,
+    TRANSLATION,
     TURNED_90,
     Supposition,
     changed,
@@ -148,7 +150,7 @@ the subject of the posterior. See docs/measured.md."""
 GROSS_OF_TWO = 0.5
 """The same for two mistakes at once, of which there are many pairs."""
 
-NOT_CORRECTABLE = (BACKWARDS, MOTION_AXES, MOTION_UNIT, COMPENSATED, CLOCK_OFFSET, OFF_BY_ONE, DISTORTION)
+NOT_CORRECTABLE = (BACKWARDS, MOTION_AXES, MOTION_UNIT, COMPENSATED, CLOCK_OFFSET, OFF_BY_ONE, DISTORTION, TRANSLATION)
 """What no pose and no lens that were tried correct."""
 
 UNITS = ((1.0 / 3.6, 1.0), (1.0, pi / 180.0))
@@ -244,6 +246,7 @@ def probable_mistake(data: WindowData, solved: Matrix4 | None) -> Mistake | None
         return of_clouds
     given = _of_given(edges, data.window.rig, solved)
     ranked = _ranked(edges, suppositions(data.window.rig), given)
+    given = _wherever_shifted(given, ranked, data.window.rig)
     late_s, timed = _other_time(data, edges, given)
     best, *_ = ranked or [given]
     certain = _is_certain(ranked, given)
@@ -259,7 +262,9 @@ def probable_mistake(data: WindowData, solved: Matrix4 | None) -> Mistake | None
         ranked = sorted(
             [*ranked, *_ranked(edges, suppositions_of_two(data.window.rig), given)], key=lambda one: -one.log_posterior
         )
-    return _named(ranked[0], given) if _is_certain(ranked, given) else _of_other_size(data.window.rig)
+    if _is_certain(ranked, given):
+        return _named(ranked[0], given)
+    return _other_translation(data, edges, ranked, given, solved) or _of_other_size(data.window.rig)
 
 
 def _is_certain(ranked: Sequence[Ranked], given: Ranked) -> bool:
@@ -287,6 +292,83 @@ def _named(best: Ranked, given: Ranked) -> Mistake:
         supposition.T_camera_lidar,
         correctable=not supposition.mirrored and supposition.code not in NOT_CORRECTABLE,
     )
+
+
+AS_SUPPOSED = 0.25
+"""A supposition explains a shift if what it leaves of it is at most this share."""
+
+
+def _wherever_shifted(given: Ranked, ranked: Sequence[Ranked], rig: Rig) -> Ranked:
+    """The inputs as given, also where a supposition led to that is only shifted against them."""
+    pose = rig.T_camera_lidar_nominal
+    shifted = (
+        one
+        for one in ranked
+        if not one.supposition.mirrored
+        and _same_lens(one, given)
+        and se3.rotation_angle_rad(one.T_camera_lidar @ se3.inverse(pose)) < REACH_RAD
+    )
+    best = max(shifted, key=lambda one: one.significance, default=given)
+    if best.significance <= given.significance:
+        return given
+    log_posterior = 0.5 * best.significance**2 + log(AS_GIVEN_ODDS) + _log_prior_of_centre(rig.camera)
+    return replace(best, supposition=given.supposition, log_posterior=log_posterior)
+
+
+def _other_translation(
+    data: WindowData, edges: Edges, ranked: Sequence[Ranked], given: Ranked, solved: Matrix4 | None
+) -> Mistake | None:
+    """A translation that the search (`solved` is its end) did not come to, though the edges fit there. None if they fit
+    about as well with the one that was given, if other inputs are about as probable, and if the shift may be that of a
+    vehicle whose clocks are off."""
+    rig, end = data.window.rig, given.T_camera_lidar
+    pose = rig.T_camera_lidar_nominal if solved is None else solved
+    turning = _local_ascent(edges, given.supposition, (pose, rig.T_camera_lidar_nominal), axes=3)
+    held = _settled(edges, turning, given.null, axes=3)
+    shift_m = _shift_m(held.T_camera_lidar, end)
+    distance_m = float(np.linalg.norm(shift_m))
+    elsewhere = (one for one in ranked if not (_same_place(one, given) and _same_lens(one, given)))
+    rivals = [held.log_posterior, *(one.log_posterior for one in elsewhere)]
+    log_prior = log(KINDS[TRANSLATION].odds / AS_GIVEN_ODDS) - 2.0 * log1p((distance_m / KNOWN_TO_M) ** 2)
+    certain = given.log_posterior + log_prior >= float(np.logaddexp.reduce(rivals)) + log(LEAST_ODDS)
+    across_m = float(np.linalg.norm(_across_the_way(data, end, shift_m)))
+    if not certain or held.significance > GROSS * given.significance or across_m < max(KNOWN_TO_M, 0.5 * distance_m):
+        return None
+    if float(np.linalg.norm(_shift_m(pose, end))) < KNOWN_TO_M:
+        return None
+    alike = (
+        one
+        for one in ranked
+        if _same_place(one, given)
+        and _same_lens(one, given)
+        and float(np.linalg.norm(_shift_m(one.supposition.T_camera_lidar, end))) <= AS_SUPPOSED * distance_m
+    )
+    supposed = max(alike, key=lambda one: one.log_posterior, default=None)
+    supposition = replace(given.supposition, code=TRANSLATION) if supposed is None else supposed.supposition
+    mistake = _named(replace(given, supposition=supposition), held)
+    right_m, down_m, ahead_m = shift_m.tolist()
+    where = f"(right {right_m:+.2f}, down {down_m:+.2f}, forward {ahead_m:+.2f})"
+    return replace(mistake, text=f"{mistake.text}; they fit with the camera {distance_m:.2f} m from there {where}")
+
+
+def _shift_m(T_from: Matrix4, T_to: Matrix4) -> NDArray[np.float64]:
+    """(3,) from the camera's centre in one pose (4, 4) to that in another, along the axes of the other camera."""
+    return np.asarray(T_to[:3, :3] @ (_centre(T_to) - _centre(T_from)))
+
+
+def _centre(T_camera_lidar: Matrix4) -> NDArray[np.float64]:
+    """(3,) the camera's centre, LiDAR frame, metres."""
+    return np.asarray(-T_camera_lidar[:3, :3].T @ T_camera_lidar[:3, 3])
+
+
+def _across_the_way(data: WindowData, T_camera_lidar: Matrix4, shift_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The part of a shift (3,), camera frame, that is not along the way of a vehicle that moves."""
+    motions = [pair.motion for pair in data.window.pairs if pair.motion is not None]
+    velocities = [sensor_twist(one, data.window.rig.T_lidar_ego)[1] for one in motions if one.reaches(LEAST_SPEED_MPS)]
+    if not velocities:
+        return shift_m
+    way = T_camera_lidar[:3, :3] @ np.mean(velocities, axis=0)
+    return np.asarray(shift_m - way * (way @ shift_m) / max(float(way @ way), LEAST_SPEED_MPS**2))
 
 
 def _other_cloud_axes(data: WindowData) -> Mistake | None:
@@ -526,12 +608,12 @@ def _shell(pose: Matrix4) -> NDArray[np.float64]:
     return moved_by(np.ascontiguousarray(pose), turns, np.zeros_like(turns))
 
 
-def _local_ascent(edges: Edges, supposition: Supposition, starts: Sequence[Matrix4]) -> Ranked:
-    """The best end of local ascents on ever finer edges."""
+def _local_ascent(edges: Edges, supposition: Supposition, starts: Sequence[Matrix4], axes: int = 6) -> Ranked:
+    """The best end of local ascents along the first `axes` of ξ, on ever finer edges."""
     ends = list(starts)
     for number, step_rad in ((MEDIUM, radians(0.3)), (FINE, radians(0.15))):
         frames = edges.seen_by(supposition, number, ASCENT_POINTS)
-        ends = _ascended(frames, ends, step_rad)
+        ends = _ascended(frames, ends, step_rad, axes)
     z = [frame_alignment(frames, end).significance for end in ends]
     best = int(np.argmax(z))
     return Ranked(supposition, ends[best], z[best], 0.0, (np.zeros(cue.KINDS), np.ones(cue.KINDS)), 0.0)
@@ -550,13 +632,13 @@ def _rezoomed(edges: Edges, supposition: Supposition, starts: Sequence[Matrix4],
     return ascended
 
 
-def _settled(edges: Edges, ascended: Ranked, null: Null | None = None) -> Ranked:
+def _settled(edges: Edges, ascended: Ranked, null: Null | None = None, axes: int = 6) -> Ranked:
     """The end of the local ascent on the finest edges. `null` as in `Ranked`; None: from poses about the end.
 
     What the edges of range and those of reflectance are worth is open, so that the log-likelihoods of both add up.
     """
     frames = edges.seen_by(ascended.supposition, FINEST, SETTLING_POINTS)
-    (end,) = _ascended(frames, [ascended.T_camera_lidar], radians(0.08))
+    (end,) = _ascended(frames, [ascended.T_camera_lidar], radians(0.08), axes)
     kind = edges.kind[thinned(len(edges.kind), SETTLING_POINTS)]
     sums = alignment_of_parts(frames, kind, cue.KINDS, np.concatenate([end[None], _shell(end)]))
     of_kinds = sums.square.sum(axis=1)
@@ -574,9 +656,9 @@ def _settled(edges: Edges, ascended: Ranked, null: Null | None = None) -> Ranked
     return Ranked(ascended.supposition, end, significance, float(square[0]), null, log_posterior)
 
 
-def _ascended(frames: EdgeFrames, poses: Sequence[Matrix4], step_rad: float) -> list[Matrix4]:
+def _ascended(frames: EdgeFrames, poses: Sequence[Matrix4], step_rad: float, axes: int) -> list[Matrix4]:
     ascents = [AscentStart(pose, 0, len(frames.maps)) for pose in poses]
-    return [summit.pose for summit in ascend(frames, ascents, _moves(step_rad))]
+    return [summit.pose for summit in ascend(frames, ascents, _moves(step_rad, axes))]
 
 
 def _with_priors(ranked: Sequence[Ranked], variants: Mapping[tuple[str, str], int]) -> list[Ranked]:
@@ -613,12 +695,12 @@ def _same_lens(one: Ranked, other: Ranked) -> bool:
     return max(map(abs, shifts)) < NOTICEABLE and a == changed(b, fx=a.fx, fy=a.fy, cx=a.cx, cy=a.cy)
 
 
-def _moves(step_rad: float) -> NDArray[np.float64]:
-    """(2, 12, 4, 4) a step either way along each axis of the camera, and half of it."""
+def _moves(step_rad: float, axes: int) -> NDArray[np.float64]:
+    """(2, 2·axes, 4, 4) a step either way along each of the first `axes` of ξ, and half of it."""
     steps = se3.axis_steps(step_rad)
     return np.array(
         [
-            [se3.perturbation(sign * share * steps * unit) for unit in np.eye(6) for sign in (1.0, -1.0)]
+            [se3.perturbation(sign * share * steps * unit) for unit in np.eye(6)[:axes] for sign in (1.0, -1.0)]
             for share in (1.0, 0.5)
         ]
     )

@@ -35,6 +35,7 @@ class Kind:
 
 INVERSE_POSE, INVERSE_ROTATION, INVERSE_TRANSLATION = "inverse_pose", "inverse_rotation", "inverse_translation"
 QUATERNION_ORDER, CAMERA_AXES, INVERSE_AND_AXES = "quaternion_order", "camera_axes", "inverse_and_axes"
+TRANSLATION = "translation_wrong"
 LIDAR_AXES, POSE_UNIT, CLOUD_FRAME = "lidar_axes", "pose_unit", "cloud_frame"
 FOCAL_LENGTH, IMAGE_SCALE, PRINCIPAL_POINT = "focal_length", "image_scale", "principal_point"
 FOCAL_LENGTHS_SWAPPED, CENTRE_SWAPPED, RECTIFIED = "focal_lengths_swapped", "centre_swapped", "rectified_image"
@@ -62,6 +63,12 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
             "the translation read as the position of the other sensor",
             "the translation of T_camera_lidar is probably the position of the camera in the LiDAR frame: "
             "t = -R·position",
+        ),
+        TRANSLATION: Kind(
+            0.1,
+            "another translation",
+            "the translation of T_camera_lidar is probably wrong: measure where the camera is, or estimate it with six "
+            "degrees of freedom (--dof 6)",
         ),
         QUATERNION_ORDER: Kind(
             0.2,
