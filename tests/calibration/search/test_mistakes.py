@@ -147,17 +147,17 @@ def of_held_centre(window: Window, T_camera_lidar: NDArray[np.float64]) -> Mista
 
 def test_a_wrong_translation_that_was_held_is_named_with_the_one_that_fits(few: Window) -> None:
     right = few.rig.T_camera_lidar_nominal
-    aside = of_held_centre(few, se3.perturb(right, np.array([0.01, 0.0, 0.0, 0.6, -0.2, 0.0])))
-    assert aside is not None
-    assert (aside.code, aside.correctable) == (mistakes.TRANSLATION, False)
-    assert "right +0.6" in aside.text
+    displaced = of_held_centre(few, se3.perturb(right, np.array([0.01, 0.0, 0.0, 0.6, -0.2, 0.0])))
+    assert displaced is not None
+    assert (displaced.code, displaced.correctable) == (mistakes.TRANSLATION, False)
+    assert "right +0.6" in displaced.text
     centre = se3.transform_from(right[:3, :3], se3.inverse(right)[:3, 3])
-    read = of_held_centre(few, centre)
-    assert read is not None
-    assert read.code == mistakes.INVERSE_TRANSLATION
+    inverse = of_held_centre(few, centre)
+    assert inverse is not None
+    assert inverse.code == mistakes.INVERSE_TRANSLATION
 
 
-def test_a_shift_along_the_way_of_a_vehicle_is_not_said_of_its_mount(few: Window) -> None:
+def test_a_shift_along_the_way_of_a_vehicle_is_no_wrong_translation(few: Window) -> None:
     ahead = of_held_centre(few, se3.perturb(few.rig.T_camera_lidar_nominal, np.array([0, 0, 0, 0, 0, 0.8])))
     assert ahead is None or ahead.code != mistakes.TRANSLATION
 
