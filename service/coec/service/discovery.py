@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
-from coec.calibration.frames.evidence import sees_alone
+from coec.calibration.frames.message_evidence import sees_alone
 from coec.calibration.types import ImageFormat, Matrix4, Reason
 from coec.config import (
     IDENTITY,

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.frames.evidence import clouds_in_turn, compensated_for, instants_s, sectors, stands
+from coec.calibration.frames.evidence import compensated_for, instants_s, stands
+from coec.calibration.frames.message_evidence import clouds_in_turn, sectors
 from coec.calibration.frames.motion_compensation import sensor_twist
 from coec.calibration.types import EgoMotion, LidarFrame
 from coec.geometry import se3

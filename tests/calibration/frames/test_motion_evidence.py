@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coec.calibration.frames.evidence import (
+from coec.calibration.frames.message_evidence import (
     PoseAndTwist,
     TwistReading,
     motions_of_poses,

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coec.calibration.frames.evidence import MOST_CLOUDS
+from coec.calibration.frames.message_evidence import MOST_CLOUDS
 from coec.calibration.frames.pairing import Pairer
 from coec.calibration.types import CameraFrame, EgoMotion, EncodedImage, Frame, ImageFormat, LidarFrame
 from coec.config import (

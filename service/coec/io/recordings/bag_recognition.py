@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError, model_validator
 
-from coec.calibration.frames import evidence
+from coec.calibration.frames import evidence, message_evidence
 from coec.calibration.frames.pairing import motion_at
 from coec.calibration.types import CameraFrame, EgoMotion, LidarFrame, Matrix4, Recognition, Rig
 from coec.config import CameraIntrinsics, FilePath, Matrix4x4, describe
@@ -78,7 +78,7 @@ class Readings:
 
     Attributes:
         rings: whether ring numbers are scan lines.
-        compensated: the instant for which points were compensated, see `calibration.frames.evidence`; empty: for none.
+        compensated: the instant for which points were compensated, see `evidence`; empty: for none.
         clouds: how many clouds make a sweep.
         motion: `twist` or `pose`: from what of an odometry the motion comes.
         camera_offset_ns, lidar_offset_ns: added to the stamps.
@@ -101,7 +101,9 @@ class Readings:
         return cls(
             _value(query, "rings", {"lines": True, "none": False}),
             _value(query, "compensated", {"no": "", **{name: name for name in ("stamp", "begin", "middle", "end")}}),
-            _value(query, "clouds_per_sweep", {str(count): count for count in range(1, evidence.MOST_CLOUDS + 1)}),
+            _value(
+                query, "clouds_per_sweep", {str(count): count for count in range(1, message_evidence.MOST_CLOUDS + 1)}
+            ),
             _value(query, "motion", {"twist": "twist", "pose": "pose"}),
             _offset_ns(query, "camera_offset"),
             _offset_ns(query, "lidar_offset"),
@@ -117,7 +119,7 @@ def _value(query: dict[str, str], key: str, values: dict[str, Value]) -> Value |
         return None
     if query[key] not in values:
         names = list(values)
-        accepted = ", ".join(names) if len(names) < evidence.MOST_CLOUDS else f"{names[0]} to {names[-1]}"
+        accepted = ", ".join(names) if len(names) < message_evidence.MOST_CLOUDS else f"{names[0]} to {names[-1]}"
         raise UsageError(f"{key}={query[key]}: it is one of {accepted}")
     return values[query[key]]
 
@@ -204,10 +206,10 @@ def motion_of_odometry(
     if motion == "pose":
         return _by_poses(reader, places), None
     sampled = [one for index in _near_each_other(places) if (one := _posed(reader, places[index])) is not None]
-    reading = evidence.reading_of_twists(sampled)
-    if reading is evidence.TwistReading.AS_STATED:
+    reading = message_evidence.reading_of_twists(sampled)
+    if reading is message_evidence.TwistReading.AS_STATED:
         return None, None
-    if reading is evidence.TwistReading.CONTRADICTED:
+    if reading is message_evidence.TwistReading.CONTRADICTED:
         text = (
             "The velocities of the odometry do not fit its poses; the velocities are used. If the poses are right, say "
             "?motion=pose; ?motion=twist leaves out this line."
@@ -223,7 +225,7 @@ def motion_of_odometry(
 def _by_poses(reader: BagReader, places: Sequence[MessageLocation]) -> tuple[EgoMotion, ...]:
     """The motion by the poses, without jumps that no vehicle makes."""
     posed = [one for place in places if (one := _posed(reader, place)) is not None]
-    motions = evidence.motions_of_poses(posed)
+    motions = message_evidence.motions_of_poses(posed)
     return tuple(
         motion for motion in motions if max(map(abs, (*(motion.linear_mps or ()), *motion.angular_radps))) <= MAX_SPEED
     )
@@ -235,16 +237,16 @@ def _near_each_other(places: Sequence[MessageLocation]) -> list[int]:
     for start in evenly_spread(len(places), SAMPLED_MOVES):
         for index in range(start, min(start + MOST_BETWEEN, len(places))):
             selected.add(index)
-            if places[index].stamp_ns - places[start].stamp_ns >= evidence.LEAST_S * 1e9:
+            if places[index].stamp_ns - places[start].stamp_ns >= message_evidence.LEAST_S * 1e9:
                 break
     return sorted(selected)
 
 
-def _posed(reader: BagReader, place: MessageLocation) -> evidence.PoseAndTwist | None:
+def _posed(reader: BagReader, place: MessageLocation) -> message_evidence.PoseAndTwist | None:
     """Pose and velocity of a message; None if it is damaged, which is told when it is used."""
     payload = reader(place.at)
     try:
-        return evidence.PoseAndTwist(odometry_pose(payload), message_decoding.odometry(payload))
+        return message_evidence.PoseAndTwist(odometry_pose(payload), message_decoding.odometry(payload))
     except DecodeError:
         return None
 
@@ -278,13 +280,17 @@ def sweeps_of_clouds(
         )
         return alone, (Recognition("several_lidars", text, "warn"),)
     # A LiDAR that does not turn shows the same sectors at once.
-    if not seen or evidence.sectors(seen[0]).sum() >= evidence.WHOLE * evidence.SECTORS or not _turning(seen):
+    if (
+        not seen
+        or message_evidence.sectors(seen[0]).sum() >= message_evidence.WHOLE * message_evidence.SECTORS
+        or not _turning(seen)
+    ):
         return alone, ()
-    seen += [cloud for place in places[FEW_CLOUDS : evidence.MOST_CLOUDS] for cloud in load(place)]
-    in_turn = evidence.clouds_in_turn([evidence.sectors(one) for one in seen])
+    seen += [cloud for place in places[FEW_CLOUDS : message_evidence.MOST_CLOUDS] for cloud in load(place)]
+    in_turn = message_evidence.clouds_in_turn([message_evidence.sectors(one) for one in seen])
     if in_turn == 1:
         return alone, ()
-    degrees = 360 * float(np.median([evidence.sectors(one).sum() for one in seen])) / evidence.SECTORS
+    degrees = 360 * float(np.median([message_evidence.sectors(one).sum() for one in seen])) / message_evidence.SECTORS
     what = f"Each cloud covers {degrees:.0f} degrees of the turn, {in_turn} in a row the whole"
     if in_turn == 2 and seen[0].time_offset_s is None:
         text = (
@@ -316,8 +322,8 @@ def _overlap(clouds: Sequence[LidarFrame]) -> bool:
 
 def _turning(seen: Sequence[LidarFrame]) -> bool:
     """Whether clouds look into different directions."""
-    covered = [evidence.sectors(one) for one in seen]
-    return bool(np.any(covered, axis=0).sum() > evidence.SAME * np.median([one.sum() for one in covered]))
+    covered = [message_evidence.sectors(one) for one in seen]
+    return bool(np.any(covered, axis=0).sum() > message_evidence.SAME * np.median([one.sum() for one in covered]))
 
 
 def _joined(places: Sequence[MessageLocation], count: int) -> list[Sweep]:
@@ -491,7 +497,7 @@ def _extrinsic(index: BagIndex, pair: PairMessages, lens: _Lens) -> tuple[Matrix
     if T is None and T_optical is None:
         raise SourceError(f"{index.path}: {unconnected_text(index, named, lidar_frame)}")
     in_view = [None if pose is None else share_in_image(lens.camera, pose, pair.cloud.xyz_m) for pose in (T_optical, T)]
-    if T is None or evidence.sees_alone(*in_view):
+    if T is None or message_evidence.sees_alone(*in_view):
         assert T_optical is not None
         why = "the transforms do not lead there" if T is None else "no points lie in the image there"
         text = (

@@ -19,7 +19,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from rosbags.typesys.stores import ros2_humble as ros
 
-from coec.calibration.frames import evidence
+from coec.calibration.frames import message_evidence
 from coec.calibration.types import EgoMotion, Matrix4
 from coec.errors import DecodeError
 from coec.geometry import se3
@@ -357,8 +357,8 @@ class OdometryMotion:
         self.note = ""
         self._source = source
         self._is_open, self._opened_ns = False, -(2**62)
-        self._compared: deque[evidence.PoseAndTwist] = deque(maxlen=2 * COMPARED)
-        self._recent: deque[evidence.PoseAndTwist] = deque()
+        self._compared: deque[message_evidence.PoseAndTwist] = deque(maxlen=2 * COMPARED)
+        self._recent: deque[message_evidence.PoseAndTwist] = deque()
 
     def motion(self, payload: bytes) -> EgoMotion | None:
         """The motion, from an `Odometry` in CDR; None: there was no earlier pose, or no vehicle moves like that.
@@ -368,16 +368,16 @@ class OdometryMotion:
         """
         stated = odometry(payload)
         if self._source == "pose":
-            return self._by_poses(evidence.PoseAndTwist(odometry_pose(payload), stated))
+            return self._by_poses(message_evidence.PoseAndTwist(odometry_pose(payload), stated))
         if self._source is None and self._is_compared(stated.stamp_ns):
-            self._compared.append(evidence.PoseAndTwist(odometry_pose(payload), stated))
+            self._compared.append(message_evidence.PoseAndTwist(odometry_pose(payload), stated))
             self._recognise()
         return stated
 
     def _is_compared(self, now_ns: int) -> bool:
         """Whether a message is the first or the second one of a comparison."""
         since_s = (now_ns - self._opened_ns) * 1e-9
-        if self._is_open and evidence.LEAST_S <= since_s <= evidence.MOST_S:
+        if self._is_open and message_evidence.LEAST_S <= since_s <= message_evidence.MOST_S:
             self._is_open = False
             return True
         if 0.0 <= since_s < COMPARED_EVERY_S:
@@ -388,13 +388,13 @@ class OdometryMotion:
         return True
 
     def _recognise(self) -> None:
-        reading = evidence.reading_of_twists(tuple(self._compared))
-        if reading is evidence.TwistReading.CONTRADICTED:
+        reading = message_evidence.reading_of_twists(tuple(self._compared))
+        if reading is message_evidence.TwistReading.CONTRADICTED:
             self.note = (
                 "The velocities of the odometry do not fit its poses; the velocities are used. If the poses are right, "
                 "say ego.motion: pose."
             )
-        elif reading is not evidence.TwistReading.AS_STATED:
+        elif reading is not message_evidence.TwistReading.AS_STATED:
             # It stays so: a vehicle that stands shows nothing.
             self._source = "pose"
             self.note = (
@@ -402,17 +402,17 @@ class OdometryMotion:
                 "of the poses. If the velocities are right, say ego.motion: twist."
             )
 
-    def _by_poses(self, message: evidence.PoseAndTwist) -> EgoMotion | None:
-        """The motion since the latest pose that is `evidence.LEAST_S` earlier."""
+    def _by_poses(self, message: message_evidence.PoseAndTwist) -> EgoMotion | None:
+        """The motion since the latest pose that is `message_evidence.LEAST_S` earlier."""
         if message.T_parent_child is None:
             return None
         recent = self._recent
         if recent and recent[-1].stamp_ns >= message.stamp_ns:
             recent.clear()
         recent.append(message)
-        while len(recent) > 2 and message.stamp_ns - recent[1].stamp_ns >= evidence.LEAST_S * 1e9:
+        while len(recent) > 2 and message.stamp_ns - recent[1].stamp_ns >= message_evidence.LEAST_S * 1e9:
             recent.popleft()
-        for motion in evidence.motions_of_poses((recent[0], message)):
+        for motion in message_evidence.motions_of_poses((recent[0], message)):
             assert motion.linear_mps is not None
             return checked(motion.stamp_ns, motion.frame_id, motion.linear_mps, motion.angular_radps)
         return None

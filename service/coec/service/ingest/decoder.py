@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coec.calibration.frames import evidence, lidar_origin
+from coec.calibration.frames import lidar_origin, message_evidence
 from coec.calibration.types import NS_PER_S, CameraFrame, EgoMotion, Frame, LidarFrame
 from coec.config import (
     IDENTITY,
@@ -597,12 +597,12 @@ class Decoder:
 
     def _compare_sectors(self, cloud: LidarFrame, covered: list[NDArray[np.bool_]]) -> None:
         """Whether the first clouds of a stream are parts of a turn; one that covers a whole turn ends the question."""
-        covered.append(evidence.sectors(cloud))
-        whole = covered[-1].sum() >= evidence.WHOLE * evidence.SECTORS
-        if not whole and len(covered) < evidence.MOST_CLOUDS:
+        covered.append(message_evidence.sectors(cloud))
+        whole = covered[-1].sum() >= message_evidence.WHOLE * message_evidence.SECTORS
+        if not whole and len(covered) < message_evidence.MOST_CLOUDS:
             return
         self._covered = None
-        in_turn = 1 if whole else evidence.clouds_in_turn(covered)
+        in_turn = 1 if whole else message_evidence.clouds_in_turn(covered)
         if in_turn > 1:
             self._note(
                 f"each cloud covers a part of the turn, {in_turn} in a row the whole, and each is taken as a sweep: "
