@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -56,7 +57,7 @@ from coec.io.ros import message_decoding, message_encoding, messages
 from coec.io.ros.camera_info import decode_info, intrinsics_of_info
 from coec.io.ros.message_decoding import ENCODINGS
 from coec.io.ros.packet_streams import PacketAssembler, PacketStream
-from coec.io.ros.transforms import MovingFrame, StaticTransforms, decode_static_transforms, frames_in
+from coec.io.ros.transforms import MovingFrame, OdometryMotion, StaticTransforms, decode_static_transforms, frames_in
 from coec.io.ros.translations import TRANSLATIONS, translation_of
 from coec.io.serialise import estimate_of, result_of
 from coec.io.video import VideoReader, VideoTrack
@@ -102,6 +103,7 @@ from fuzz.formats import (
     with_checksum,
 )
 from fuzz.loop import Target
+from support.encodings import of_cloudini, of_draco, of_zlib, of_zstd, packed_message
 from support.estimates import ESTIMATE_RIG, a_baseline, estimate
 from support.packets import (
     HESAI,
@@ -222,6 +224,41 @@ def _transforms_seeds() -> list[bytes]:
     vehicle = [("odom", "base_link", STAMP_NS + k * 20_000_000, pose) for k, pose in enumerate((begin, end))]
     wheel = ("base_link", "wheel", STAMP_NS, end)
     return [transforms(), transforms(*vehicle), transforms(vehicle[0], wheel, vehicle[1])]
+
+
+def _odometry(data: bytes, folder: Path) -> None:
+    """The message again and again, by its velocity and by its pose."""
+    del folder
+    for reader in (OdometryMotion(None), OdometryMotion("pose")):
+        for second in range(3):
+            motion = reader.motion(data[:4] + struct.pack("<I", second) + data[8:])
+            assert motion is None or np.isfinite([*(motion.linear_mps or ()), *motion.angular_radps]).all()
+
+
+PACKED_POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("ring", "<u2"), ("t", "<u4")])
+PACKERS = {"zlib": of_zlib, "zstd": of_zstd, "draco": of_draco, "cloudini": of_cloudini}
+
+
+def _packed(data: bytes, folder: Path) -> None:
+    """The first byte chooses the type."""
+    del folder
+    types = (messages.COMPRESSED_CLOUD, messages.FOXGLOVE_CLOUD)
+    _inspected(message_decoding.decode(types[(data[0] if data else 0) % 2], data[1:], LIMITS))
+
+
+def _packed_seeds() -> list[bytes]:
+    """A message in each form whose library is installed."""
+    rows = np.zeros(6, PACKED_POINT)
+    rows["x"], rows["ring"], rows["t"] = np.arange(6) + 1.0, np.arange(6) % 2, np.arange(6) * 10_000_000
+    fields = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("ring", 12, 4), ("t", 14, 6)]
+    libraries = {"draco": "DracoPy", "cloudini": "pureini"}
+    forms = {form: pack(rows) for form, pack in PACKERS.items() if form not in libraries or find_spec(libraries[form])}
+    seeds = [
+        b"\0" + packed_message(Packer().header("lidar"), form, packed, len(rows), PACKED_POINT.itemsize, fields)
+        for form, packed in forms.items()
+    ]
+    pose = Packer().header("lidar").put("d", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    return [*seeds, *([b"\1" + pose.octets(forms["draco"]).text("draco").done()] if "draco" in forms else [])]
 
 
 TIME_REPORTED = PointTimeConfig(field="t", unit="us", base="clock")
@@ -1006,6 +1043,8 @@ TARGETS: Final = {
         Target(
             "cdr", _cdr, _cdr_seeds, labels=(*(name.encode() for name in ENCODINGS), b"timestamp", b"time_offset_ns")
         ),
+        Target("packed", _packed, _packed_seeds, labels=(b"draco", b"zlib", b"zstd", b"cloudini")),
+        Target("odometry", _odometry, lambda: [odometry()], labels=(b"odom\0", b"base_link\0")),
         Target("transforms", _transforms, _transforms_seeds, labels=(b"odom\0", b"base_link\0")),
         Target(
             "pcd", lambda data, folder: _cloud_file(data, folder, "pcd"), _pcd_seeds, labels=(b"FIELDS", b"_", b"ring")
