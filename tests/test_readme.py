@@ -100,7 +100,7 @@ RIG_LIDARS = 'coec lidars "sim:rig=four-fisheyes&seconds=4" roof near_left'
 RIG_DEMO = "coec demo --rig"
 RIG_MOVES = "coec sim rig-moves --drives 5 --rigs 5"
 TUTORIAL_DRIVE = "sim:seed=1&seconds=40&camera_hz=1&lidar_hz=1&workshop=0.8,-0.6,0.5"
-SMALL_DRIVE = TUTORIAL_DRIVE.replace("seconds=40", "seconds=24&camera=fisheye200&lidar=32&depth=yes")
+SMALL_DRIVE = TUTORIAL_DRIVE.replace("seconds=40", "seconds=20&ego_hz=10&camera=fisheye200&lidar=32&depth=yes")
 SIM_CALIBRATE = 'coec calibrate "sim:seed=3&seconds=60&camera_hz=0.4&lidar_hz=0.4" --perturb 3,-3,2'
 TO_JSON = f'coec calibrate "kitti360:{SAMPLES}/kitti360?camera=image_00" --depth stereo --json > result.json'
 COMMISSION = "coec commission SOURCE... --output rig.json"

@@ -33,8 +33,8 @@ from pydantic import BaseModel
 from coec.config import Config, ZenohConfig
 from coec.errors import UsageError
 from coec.io.zenoh import query_client
-from coec.io.zenoh.bus import MSGPACK
 from coec.io.zenoh.command_auth import CommandSender
+from coec.io.zenoh.query_client import MSGPACK
 from coec.io.zenoh.session import connected_of, credentials_in, read_settings
 from coec.io.zenoh.subscriptions import PairUpdate, subscribed
 from coec.schemas.commands import COMMAND_NAMES, Acknowledgement, CommandName

@@ -26,13 +26,17 @@ from coec.calibration.solver import prepare_window_data
 from coec.calibration.uncertainty.systematic import require_fit
 from coec.calibration_options import CalibrationOptions, Progress, checked, configuration_of
 from coec.config import CalibrationConfig, LimitsConfig, VerdictConfig, WindowConfig
-from coec.errors import CalibrationError, DecodeError, NotAcceptedError, SourceError, UsageError
+from coec.errors import CalibrationError, DecodeError, UsageError
 from coec.geometry.cameras import intrinsics_of, name_of
 from coec.geometry.cameras.double_sphere_fit import fit_double_sphere
 from coec.io import user_files
 from coec.io.depth.depth_maps import open_depth
-from coec.io.exported_extrinsic import ExportedExtrinsic, ExportFrames, extrinsic_of_result
-from coec.io.exports import FORMATS
+from coec.io.exported_extrinsic import (
+    ExportFrames,
+    export_text,
+    extrinsic_of_result,
+    require_accepted,
+)
 from coec.io.images import GreyImages
 from coec.io.recordings import window_cutting
 from coec.io.recordings.bag import MOTION_LEFT_OUT
@@ -51,9 +55,6 @@ from coec.schemas.replies import CalibrationResult, Lens, MetricReply, Reason, V
 from coec.untrusted import Untrusted, printable
 
 NS_PER_S = 1e9
-
-MAX_EXPORT_BYTES = 64 * 2**20
-"""Largest file that is read or changed by an export, bytes. A robot's URDF has less than one million."""
 
 FITTABLE = "double_sphere"
 """The only model that can be fitted to another one."""
@@ -322,53 +323,6 @@ class CallbackProgress:
         """See `calibration.types.Progress`."""
         if self.callback is not None:
             self.callback(stage, done, total)
-
-
-def require_accepted(extrinsic: ExportedExtrinsic, name: str, override: str, *, force: bool) -> None:
-    """Returns if the extrinsic may be written. `name` (of the calibration) and `override` (the option that forces
-    the export) appear in the error message.
-
-    Raises:
-        NotAcceptedError: its verdict is negative, and `force` is False.
-    """
-    if extrinsic.origin.rejection_reasons and not force:
-        raise NotAcceptedError(
-            f"{name}: not accepted: {' '.join(extrinsic.origin.rejection_reasons)} "
-            f"`{override}` exports it all the same, and says so in the file."
-        )
-
-
-def export_text(extrinsic: ExportedExtrinsic, form: str, path: Path | None) -> str:
-    """The new text of the file `path` (None: there is none). Its present content stays where the format has room for
-    it.
-
-    Raises:
-        UsageError: no such format.
-        SourceError: the present file cannot be read, or is not text.
-        OutputError: the present content cannot be changed.
-    """
-    require_format(form)
-    return FORMATS[form].text(extrinsic, None if path is None else _present_text(path))
-
-
-def require_format(form: str) -> None:
-    """Returns if the format exists.
-
-    Raises:
-        UsageError: there is no such format; the message lists those that exist.
-    """
-    if form not in FORMATS:
-        raise UsageError(f"format {form}: known are {', '.join(FORMATS)}")
-
-
-def _present_text(path: Path) -> str | None:
-    """Text of the file that is to be changed; None where there is no file."""
-    if not path.exists():
-        return None
-    try:
-        return user_files.read_bytes(path, MAX_EXPORT_BYTES).decode()
-    except UnicodeDecodeError as error:
-        raise SourceError(f"{path} is not UTF-8 text: it cannot be changed") from error
 
 
 Pose = Literal["result", "start", "nominal"]

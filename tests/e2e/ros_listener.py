@@ -30,10 +30,14 @@ class Listener:
     """What came, by topic, in the order in which it came."""
 
     samples: dict[str, list[zenoh.Sample]] = field(default_factory=lambda: defaultdict(list))
+    decoded: dict[str, list[Any]] = field(default_factory=lambda: defaultdict(list))
 
     def messages(self, topic: str, type_name: str) -> list[Any]:
-        """Decoded."""
-        return [_STORE.deserialize_cdr(s.payload.to_bytes(), type_name) for s in list(self.samples[topic])]
+        """Decoded, each once: a test that waits looks at them again and again."""
+        samples, decoded = self.samples[topic], self.decoded[topic]
+        while len(decoded) < len(samples):
+            decoded.append(_STORE.deserialize_cdr(samples[len(decoded)].payload.to_bytes(), type_name))
+        return list(decoded)
 
     def statuses(self, pair: str) -> list[Any]:
         """Of a pair, of every `/diagnostics` that came."""

@@ -212,9 +212,8 @@ def _answers(
     anonymous: bool,
 ) -> list[Reply]:
     """Answers to the query; a command is authenticated if the session has a certificate."""
-    from coec.io.zenoh.bus import JSON, MSGPACK
     from coec.io.zenoh.command_auth import CommandSender
-    from coec.io.zenoh.query_client import myself, query_all, send_authenticated
+    from coec.io.zenoh.query_client import JSON, MSGPACK, myself, query_all, send_authenticated
 
     selector = _selector(key, _params(key, request))
     credentials = address.credentials
@@ -371,7 +370,7 @@ def _value(reply: Reply) -> Any:
     Raises:
         DecodeError: the sender calls it JSON, but it is not.
     """
-    from coec.io.zenoh.bus import JSON
+    from coec.io.zenoh.query_client import JSON
 
     if reply.encoding.startswith(JSON):
         return _json(reply)
@@ -379,7 +378,7 @@ def _value(reply: Reply) -> Any:
 
 
 def _render(reply: Reply, kind: str | None) -> None:
-    from coec.io.zenoh.bus import JSON
+    from coec.io.zenoh.query_client import JSON
     from coec.reports import replies as tables
 
     shown = tables.BY_KIND.get(kind or "")

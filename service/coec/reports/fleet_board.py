@@ -2,13 +2,11 @@
 
 from collections.abc import Sequence
 
-import cv2
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from coec.config import LimitsConfig
-from coec.io.images import decode_bgr, probe
 from coec.reports import console
 from coec.reports.formatting import count
 from coec.schemas.documents import FleetNow, PairNow
@@ -131,6 +129,10 @@ def half_block_text(jpeg: bytes, columns: int, rows: int) -> Text:
     Raises:
         DecodeError: it cannot be decoded, or is larger than a picture may be.
     """
+    import cv2  # a board without a picture does without
+
+    from coec.io.images import decode_bgr, probe
+
     pixels = decode_bgr(probe(jpeg, LIMITS), LIMITS)
     height, width = pixels.shape[:2]
     scale = min(columns / width, 2 * rows / height)

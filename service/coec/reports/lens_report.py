@@ -1,11 +1,16 @@
 """The lens as `coec calibrate --intrinsics` reports it: as given, as estimated, and what to do if the two differ."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from coec.reports import console
 from coec.reports.formatting import NONE, number
-from coec.reports.page import Section, Table, Text
 from coec.schemas.replies import Intrinsics, Lens, LensDrift, LensTerm
+
+if TYPE_CHECKING:
+    from coec.reports.page import Section
 
 NO_LENS = (
     "The lens was not estimated: the objective uses no edges (use `--objective fused`), or the edges of this window "
@@ -105,6 +110,8 @@ def show(lens: Lens | None, given: Intrinsics | None) -> None:
 
 def section(lens: Lens | None, given: Intrinsics | None) -> Section:
     """The section of a page."""
+    from coec.reports.page import Section, Table, Text  # pictures, which most that show a lens do without
+
     if lens is None or given is None:
         return Section("Lens", (Text((NO_LENS,)),))
     rows: Sequence[Sequence[str]] = rows_of(lens, given)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from calibration.conftest import window_of
 from coec.calibration.frames.motion_compensation import compensate
 from coec.calibration.search import mistakes
 from coec.calibration.search.mistake_ranking import probable_mistake
-from coec.calibration.search.mistakes import changed
+from coec.calibration.search.mistakes import changed, suppositions
 from coec.calibration.solver import WindowData
 from coec.calibration.types import CameraFrame, CloudFrame, Mistake, Rig, Window
 from coec.config import DepthConfig, LimitsConfig
@@ -34,8 +34,22 @@ STREET = "sim:seed=5&seconds=48&camera_hz=0.17&lidar_hz=0.17&camera=pinhole640x3
 
 DEPTH = open_depth(DepthConfig(model="stereo"), LimitsConfig())
 
+POSES = (
+    mistakes.QUATERNION_ORDER,
+    mistakes.INVERSE_POSE,
+    mistakes.CAMERA_AXES,
+    mistakes.INVERSE_AND_AXES,
+    mistakes.LIDAR_AXES,
+)
+LENSES = (mistakes.FOCAL_LENGTH, mistakes.IMAGE_SCALE, mistakes.CENTRE_SWAPPED)
+
 BODY = se3.transform_from(mistakes.OPTICAL_FROM_BODY.T, np.zeros(3))
 """T_body_optical."""
+
+
+def first_and_slow(values: Sequence[object]) -> list[object]:
+    """What a whole search tries: the first, and in the long form the others, which differ in a line of a table."""
+    return [values[0], *(pytest.param(value, marks=pytest.mark.slow) for value in values[1:])]
 
 
 class EditedImages(GreyImages):
@@ -104,6 +118,7 @@ def wrong_lens(code: str, rig: Rig) -> Rig:
     return replace(rig, camera=changed(camera, **lenses[code]))
 
 
+@pytest.mark.slow
 def test_right_inputs_are_not_accused(few: Window) -> None:
     assert named(few) is None
     assert named(given(few, approximate(few.rig))) is None
@@ -116,16 +131,22 @@ def test_a_window_that_fits_nothing_accuses_nothing(few: Window) -> None:
     assert named(replace(few, pairs=few.pairs[:2])) is None
 
 
-@pytest.mark.parametrize(
-    "code",
-    [
-        mistakes.INVERSE_POSE,
-        mistakes.QUATERNION_ORDER,
-        mistakes.CAMERA_AXES,
-        mistakes.INVERSE_AND_AXES,
-        mistakes.LIDAR_AXES,
-    ],
-)
+@pytest.mark.parametrize("code", POSES)
+def test_what_undoes_a_wrong_pose_is_supposed(few: Window, code: str) -> None:
+    right = approximate(few.rig)
+    supposed = [one for one in suppositions(wrong_pose(code, right)) if one.code == code]
+    assert any(np.allclose(one.T_camera_lidar, right.T_camera_lidar_nominal, atol=1e-9) for one in supposed)
+
+
+@pytest.mark.parametrize("code", LENSES)
+def test_what_undoes_a_wrong_lens_is_supposed(few: Window, code: str) -> None:
+    right = few.rig.camera
+    supposed = [one.camera for one in suppositions(wrong_lens(code, few.rig)) if one.code == code]
+    near = [camera for camera in supposed if camera.fx == pytest.approx(right.fx, rel=0.1)]
+    assert any((camera.cx, camera.cy) == pytest.approx((right.cx, right.cy), abs=1e-6) for camera in near)
+
+
+@pytest.mark.parametrize("code", first_and_slow(POSES))
 def test_a_wrong_pose_is_named_and_corrected(few: Window, code: str) -> None:
     right = approximate(few.rig)
     mistake = named(given(few, wrong_pose(code, right)))
@@ -249,7 +270,7 @@ def test_two_mistakes_at_once_are_named(few: Window) -> None:
         assert mistakes.KINDS[code].advice in mistake.text
 
 
-@pytest.mark.parametrize("later", [1, -1])
+@pytest.mark.parametrize("later", first_and_slow((1, -1)))
 def test_images_that_are_listed_off_by_one_are_named(street: Window, later: int) -> None:
     images = [pair.camera.image for pair in street.pairs]
     shifted = tuple(
@@ -261,7 +282,7 @@ def test_images_that_are_listed_off_by_one_are_named(street: Window, later: int)
     assert (mistake.code, mistake.correctable) == (mistakes.OFF_BY_ONE, False)
 
 
-@pytest.mark.parametrize("code", [mistakes.FOCAL_LENGTH, mistakes.IMAGE_SCALE, mistakes.CENTRE_SWAPPED])
+@pytest.mark.parametrize("code", first_and_slow(LENSES))
 def test_a_wrong_lens_is_named_and_corrected(few: Window, code: str) -> None:
     mistake = named(given(few, wrong_lens(code, approximate(few.rig))))
     assert mistake is not None
@@ -273,7 +294,12 @@ def test_a_wrong_lens_is_named_and_corrected(few: Window, code: str) -> None:
 
 @pytest.mark.parametrize(
     ("code", "edit"),
-    [(mistakes.TURNED_180, lambda grey: grey[::-1, ::-1]), (mistakes.MIRRORED, lambda grey: grey[:, ::-1])],
+    [
+        pytest.param(
+            mistakes.TURNED_180, lambda grey: grey[::-1, ::-1], marks=pytest.mark.slow
+        ),  # also one of two at once
+        (mistakes.MIRRORED, lambda grey: grey[:, ::-1]),
+    ],
 )
 def test_images_that_are_turned_or_mirrored_are_named(few: Window, code: str, edit: Edit) -> None:
     mistake = named(given(few, approximate(few.rig)), edit)
@@ -316,7 +342,7 @@ def test_motion_that_is_given_backwards_is_named(street: Window) -> None:
     assert (mistake.code, mistake.correctable) == (mistakes.BACKWARDS, False)
 
 
-@pytest.mark.parametrize("has_rings", [True, False])
+@pytest.mark.parametrize("has_rings", first_and_slow((False, True)))
 def test_clouds_in_optical_axes_are_named_and_corrected(street: Window, has_rings: bool) -> None:
     axes = mistakes.OPTICAL_FROM_BODY.astype(np.float32)
     optical = tuple(

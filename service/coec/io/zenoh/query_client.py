@@ -43,7 +43,7 @@ from coec.schemas.keys import MAX_COMMAND_TIMEOUT_MS, MAX_LENGTH, Keys
 from coec.schemas.message import from_json, from_msgpack, to_json
 from coec.schemas.replies import ErrorReply, SnippetInfo, WindowInfo, WindowsReply
 
-JSON = "application/json"
+JSON, MSGPACK = "application/json", "application/msgpack"
 ENDPOINT = re.compile(r"[a-z0-9-]+/[^\s/].*")
 """PROTOCOL/ADDRESS, as Zenoh writes it."""
 
