@@ -47,10 +47,16 @@ def sweep(
     local = points_m @ T_lidar_ego[:3, :3].T + T_lidar_ego[:3, 3]
     if after_s is not None and motion is not None:
         assert motion.linear_mps is not None
-        twist = np.array([*motion.angular_radps, *motion.linear_mps])
-        for i, seconds in enumerate(after_s):
-            ego = se3.inverse(se3.exp(twist * seconds))
-            local[i] = (T_lidar_ego @ ego @ np.array([*points_m[i], 1.0]))[:3]
+        # Most points have an instant of their own: the motion of each is exp(-twist * seconds), written out.
+        turn, way = np.array(motion.angular_radps), -np.multiply.outer(after_s, motion.linear_mps)
+        axis = turn / max(float(np.linalg.norm(turn)), 1e-12)
+        angle = -after_s[:, None] * np.linalg.norm(turn)
+        share = np.sinc(angle / np.pi)  # of the chord in the arc
+        drop = (1.0 - np.cos(angle)) / np.where(angle == 0.0, 1.0, angle)
+        turned = points_m * np.cos(angle) + np.cross(axis, points_m) * np.sin(angle)
+        turned += axis * (points_m @ axis)[:, None] * (1.0 - np.cos(angle))
+        moved = way * share + np.cross(axis, way) * drop + axis * (way @ axis)[:, None] * (1.0 - share)
+        local = (turned + moved) @ T_lidar_ego[:3, :3].T + T_lidar_ego[:3, 3]
     range_m = np.linalg.norm(local, axis=1, keepdims=True)
     local *= (range_m + longer_m + rng.normal(0, NOISE_M, range_m.shape)) / range_m
     offsets = None if after_s is None else (after_s - stamp_ns * 1e-9).astype(np.float32)

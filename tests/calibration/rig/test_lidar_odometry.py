@@ -20,7 +20,7 @@ def consecutive(shape: Shape, motion: EgoMotion, *, turns: float = 1.0, seed: in
     """Two sweeps of a LiDAR that moves, with the time of each point, so many turns apart."""
     rng = np.random.default_rng(seed)
     sweeps = []
-    for number, count in ((0, 5_000), (1, 2_500)):
+    for number, count in ((0, 5_000), (1, 1_600)):
         stamp_s = number * turns * TURN_S
         after_s = stamp_s + rng.uniform(-0.5 * TURN_S, 0.5 * TURN_S, count)
         frame = sweep(
