@@ -317,7 +317,12 @@ def test_a_second_daemon_on_the_same_directory_is_refused(idle: Service) -> None
 
 
 @pytest.mark.fault("`insecure: true`", "health and status say so, and no key is shown")
-def test_a_door_for_everybody_is_reported_and_keys_are_hidden(tmp_path: Path, drive: Drive, router: Router) -> None:
+@pytest.mark.fault("a damaged state at the start", "health says so, and nominal is served")
+def test_a_door_for_everybody_and_a_damaged_state_are_reported_and_keys_are_hidden(
+    tmp_path: Path, drive: Drive, router: Router
+) -> None:
+    (tmp_path / "state").mkdir()
+    (tmp_path / "state" / "state.json").write_text('{"body":{}}')
     path = configured(tmp_path, drive, router)
     config = load_config(path)
     secret = "c2VjcmV0"
@@ -331,6 +336,9 @@ def test_a_door_for_everybody_is_reported_and_keys_are_hidden(tmp_path: Path, dr
     with service(path, None, warm=False) as running:
         for reported in (running.health(), running.status()):
             assert "insecure" in [reason["code"] for reason in reported["reasons"]]
+        assert "state_damaged" in [reason["code"] for reason in running.health()["reasons"]]
+        assert running.counters()["losses"] == {"state_damaged": 1}
+        assert running.extrinsic()["provenance"] == "nominal"
         (shown,) = running.query(running.keys.config)["config"]["zenoh"]["connect"]
         assert shown.endswith("#connect_private_key_base64=***")
         assert running.terminate() == 0
@@ -349,17 +357,6 @@ def test_a_second_daemon_of_the_vehicle_leaves_and_says_who_is_there(idle: Servi
     assert b"is served by another daemon, started 20" in second.stdout
     assert b'"code": "unavailable"' in second.stdout
     assert idle.status()["pairs"], "the first goes on"
-
-
-@pytest.mark.fault("a damaged state at the start", "health says so, and nominal is served")
-def test_a_damaged_state_is_reported_and_nominal_is_served(tmp_path: Path, drive: Drive, router: Router) -> None:
-    (tmp_path / "state").mkdir()
-    (tmp_path / "state" / "state.json").write_text('{"body":{}}')
-    with service(configured(tmp_path, drive, router), router, warm=False) as running:
-        assert "state_damaged" in [reason["code"] for reason in running.health()["reasons"]]
-        assert running.counters()["losses"] == {"state_damaged": 1}
-        assert running.extrinsic()["provenance"] == "nominal"
-        assert running.terminate() == 0
 
 
 @pytest.mark.slow

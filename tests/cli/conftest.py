@@ -43,6 +43,17 @@ class ReportedSteps:
         self.progress.step(stage, done, total)
 
 
+@pytest.fixture(autouse=True)
+def mistakes_unsought(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No mistake in the inputs is looked for where a window is refused, which takes ten times as long as its solve:
+    `test_mistakes` replaces this."""
+    monkeypatch.setattr("coec.recording.probable_mistake", unsought)
+
+
+def unsought(*_: object) -> None:
+    """`coec.recording.probable_mistake`, which names none."""
+
+
 @pytest.fixture(scope="session")
 def calibrated_once() -> Callable[..., tuple[Estimate, Mistake | None]]:
     """`coec.recording.calibrated`, which solves a window once for all commands that are given it with the same network

@@ -73,6 +73,6 @@ def test_damaged_frames_are_counted_by_check_and_calibrate(coec: Coec, tmp_path:
     image.write_bytes(image.read_bytes()[:-20])
     checked = coec("check", source, "--depth", "stereo")
     assert f"warn  Frames or records are left out, 1 damaged (1 image_truncated); the first: {image}" in checked.out
-    document = coec("calibrate", source, "--depth", "stereo", "--json").document
+    document = coec("calibrate", source, "--depth", "stereo", "--objective", "mi", "--json").document
     assert document["pairs"] == 7
     assert [one["code"] for one in document["recognitions"]] == ["damaged_frames"]

@@ -53,6 +53,11 @@ def manifest(folder: Path, camera: Camera, rows: NDArray[np.float64]) -> Path:
     return folder
 
 
+@pytest.fixture(autouse=True)
+def mistakes_unsought() -> None:
+    """They are looked for."""
+
+
 @pytest.fixture(scope="module")
 def rig() -> Rig:
     return rendered_source(STREET).rig

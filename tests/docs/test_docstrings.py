@@ -52,10 +52,12 @@ def unknown(node: Documented) -> list[str]:
 def test_docstrings_name_the_arguments_and_attributes_that_are_there(package: str) -> None:
     paths = sorted((REPOSITORY / package).rglob("*.py"))
     assert paths
+    sources = {path: path.read_text(encoding="utf-8") for path in paths}
     stale = {
         f"{path.relative_to(REPOSITORY)}: {node.name}: {name}"
-        for path in paths
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for path, source in sources.items()
+        if "Args:" in source or "Attributes:" in source  # to parse the others takes most of the time
+        for node in ast.walk(ast.parse(source))
         if isinstance(node, Documented)
         for name in unknown(node)
     }

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coec.calibration.types import EgoMotion, LidarFrame, Matrix4
-from coec.geometry import se3
 
 Doubles = NDArray[np.float64]
 

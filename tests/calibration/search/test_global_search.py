@@ -171,6 +171,7 @@ def test_rotation_only_has_no_rim_of_translation() -> None:
     assert not at_rim(se3.perturb(START, np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])), START, TURN)
 
 
+@pytest.mark.slow  # of kept windows the golden decisions tell the bytes
 def test_same_input_same_basins_to_the_bit(sharp_street: Window, sharp_edges: EdgeCue) -> None:
     start = away_from(sharp_street.rig.T_camera_lidar_nominal, 12.0, 3)
     first, second = (find_basins(sharp_edges, start, BOTH) for _ in range(2))

@@ -68,11 +68,23 @@ def other_lens(right: float, down: float, longer: float) -> Camera:
     )
 
 
+MEASURED: dict[tuple[int, ...], Posterior] = {}
+"""What is right, by what is held: several tests look at it."""
+
+
+def of_what_is_right(held: tuple[int, ...], rng: np.random.Generator) -> Posterior:
+    """Next to the pose that is."""
+    if held not in MEASURED:
+        points, neighbour = corner_points(rng), se3.perturbation(np.array([1e-3, -1e-3, 1e-3, 0.0, 0.0, 0.0]))
+        levels = corner_edge_levels(corner_pixels(points), points)
+        MEASURED[held] = measured(levels, corner_motions(), neighbour, held)
+    return MEASURED[held]
+
+
 @pytest.mark.parametrize("held", [(), ALL_HELD])
 def test_what_is_right_is_not_contradicted(held: tuple[int, ...], rng: np.random.Generator) -> None:
     """The pose itself may be off by a little: that is no fault of what was assumed."""
-    points, neighbour = corner_points(rng), se3.perturbation(np.array([1e-3, -1e-3, 1e-3, 0.0, 0.0, 0.0]))
-    result = measured(corner_edge_levels(corner_pixels(points), points), corner_motions(), neighbour, held)
+    result = of_what_is_right(held, rng)
     assert result.probability(NOMINAL) > 0.8
     np.testing.assert_allclose(result.hypotheses[0].deviation[:3], [-1e-3, 1e-3, -1e-3], atol=1e-3)
     assert 0.0 < result.independent_share <= 1.0
@@ -272,16 +284,14 @@ def test_an_uncertain_lens_makes_the_pose_uncertain(rng: np.random.Generator) ->
 
 
 def test_noise_and_shifts_are_the_covariance_of_the_nominal_hypothesis(rng: np.random.Generator) -> None:
-    points = corner_points(rng)
-    result = measured(corner_edge_levels(corner_pixels(points), points), corner_motions())
+    result = of_what_is_right((), rng)
     named = [result.shifts(range(6))[name] for place, name in NAMES.items() if place > 5]
     whole = result.noise(range(6)) + sum(np.outer(one, one) for one in named)
     np.testing.assert_allclose(whole, result.hypotheses[0].covariance[:6, :6], rtol=1e-6, atol=1e-15)
 
 
 def test_probabilities_sum_to_one_and_their_odds_are_bounded(rng: np.random.Generator) -> None:
-    points = corner_points(rng)
-    result = measured(corner_edge_levels(corner_pixels(points), points), corner_motions(), held=ALL_HELD)
+    result = of_what_is_right(ALL_HELD, rng)
     assert sum(one.probability for one in result.hypotheses) == pytest.approx(1.0)
     assert log_odds(0.5) == 0.0
     assert np.isfinite([log_odds(0.0), log_odds(1.0)]).all()
