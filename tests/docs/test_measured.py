@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 from pathlib import Path
 
@@ -16,6 +17,7 @@ ROWS = re.findall(
 )
 
 
+@functools.cache
 def values_of(path: Path) -> dict[str, str]:
     """Sources of the values of the constants of a module, by name; names that are assigned together are joined."""
     source = path.read_text(encoding="utf-8")
