@@ -113,6 +113,9 @@ KNOWN_TO_RAD = radians(2.0)
 KNOWN_TO_M = 0.2
 """Scale of the shift, likewise."""
 
+SHIFT_M = 0.5
+"""How far along each axis of the camera further ascents of the inputs as given begin: ascents lead about as far."""
+
 LEAST_ODDS = 1000.0
 """Posterior odds from which on a mistake is named. See docs/measured.md."""
 
@@ -556,9 +559,11 @@ def _of_other_size(rig: Rig) -> Mistake | None:
 
 
 def _of_given(edges: Edges, rig: Rig, solved: Matrix4 | None) -> Ranked:
-    """The inputs as given, wherever they fit best."""
-    screened = _screened(edges, Supposition(AS_GIVEN, rig.camera, rig.T_camera_lidar_nominal))
-    starts = screened.starts if solved is None else (*screened.starts, solved)
+    """The inputs as given, wherever they fit best, also with another translation."""
+    pose = rig.T_camera_lidar_nominal
+    screened = _screened(edges, Supposition(AS_GIVEN, rig.camera, pose))
+    shifts = np.concatenate([SHIFT_M * np.eye(6)[3:], -SHIFT_M * np.eye(6)[3:]])
+    starts = [*screened.starts, *(se3.perturb(pose, shift) for shift in shifts), *([] if solved is None else [solved])]
     return _settled(edges, _local_ascent(edges, screened.supposition, starts))
 
 
