@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from calibration.conftest import window_of
 from coec.calibration.frames.motion_compensation import compensate
-from coec.calibration.search import mistake_ranking, mistakes
+from coec.calibration.search import mistakes
 from coec.calibration.search.mistake_ranking import probable_mistake
 from coec.calibration.search.mistakes import changed, suppositions
 from coec.calibration.solver import WindowData
@@ -71,15 +71,6 @@ def named(window: Window, edit: Edit | None = None) -> Mistake | None:
 
 def given(window: Window, rig: Rig) -> Window:
     return replace(window, rig=rig)
-
-
-@pytest.fixture(autouse=True)
-def fewer_ascents(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
-    """Half of what is ascended names the same, in half of the time; the long form ascends all, as the golden windows
-    always do."""
-    if request.config.getoption("markexpr"):
-        monkeypatch.setattr(mistake_ranking, "ASCENTS", 4)
-        monkeypatch.setattr(mistake_ranking, "ASCENDING", 12)
 
 
 @pytest.fixture(scope="module")
