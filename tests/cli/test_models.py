@@ -166,11 +166,25 @@ def test_assessment_as_text(coec: Coec) -> None:
     assert not outcome.err
 
 
+def test_the_verdict_on_three_frames_of_a_recording(coec: Coec, sample_data: Path) -> None:
+    network, source = sample_data / "depth" / "tcsmallnet_dyn.onnx", f"kitti360:{sample_data}/kitti360?camera=image_00"
+    outcome = coec("models", "assess", network, source, "--frames", "3", "--json")
+    assert outcome.document["suitability"] == "usable_in_fused"
+    assert outcome.document["rank_correlation"] == pytest.approx(0.90, abs=0.02)
+    assert outcome.status == 0
+
+
 @pytest.mark.parametrize(
     ("model", "source", "suitability", "rank"),
     [
         pytest.param("stereo", "kitti360:{}/kitti360?camera=image_00", "good", 0.90, marks=pytest.mark.slow),
-        ("tcsmallnet_dyn.onnx", "kitti360:{}/kitti360?camera=image_00", "usable_in_fused", 0.90),
+        pytest.param(
+            "tcsmallnet_dyn.onnx",
+            "kitti360:{}/kitti360?camera=image_00",
+            "usable_in_fused",
+            0.90,
+            marks=pytest.mark.slow,
+        ),
         ("meter_xxs_kitti_192x640.onnx", "{}/fisheye_garage/dataset.yaml", "do_not_use", 0.08),
     ],
 )

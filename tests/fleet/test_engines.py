@@ -20,6 +20,8 @@ from coec.io.mcap.windows import read_result
 from coec.schemas.message import to_json
 
 MIB = 2**20
+CHECK_AGAIN_S = 0.01
+"""Between two checks of which processes read: to check all the time takes the core that they need."""
 BOUNDS = WorkerLimits(120.0, 4096 * MIB)
 
 
@@ -34,7 +36,7 @@ def poisoned(tmp_path: Path) -> Iterator[str]:
         while not stop.is_set():
             with path.open("wb"):  # returns when somebody reads, which may be before the reader's descriptor is listed
                 readers: list[psutil.Process] = []
-                while not (readers or stop.is_set()):
+                while not (readers or stop.wait(CHECK_AGAIN_S)):
                     readers = [child for child in psutil.Process().children(recursive=True) if _reads(child, path)]
                 for reader in readers:
                     reader.kill()
