@@ -297,6 +297,9 @@ def _named(best: Ranked, given: Ranked) -> Mistake:
     )
 
 
+MOST_LATE_S = 0.3
+"""A shift along the way of a vehicle may be that of clocks which are off by so much."""
+
 AS_SUPPOSED = 0.25
 """A supposition explains a shift if what it leaves of it is at most this share."""
 
@@ -365,13 +368,15 @@ def _centre(T_camera_lidar: Matrix4) -> NDArray[np.float64]:
 
 
 def _across_the_way(data: WindowData, T_camera_lidar: Matrix4, shift_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The part of a shift (3,), camera frame, that is not along the way of a vehicle that moves."""
+    """The part of a shift (3,), camera frame, that clocks which are off by up to `MOST_LATE_S` do not make of the way
+    of a vehicle that moves."""
     motions = [pair.motion for pair in data.window.pairs if pair.motion is not None]
     velocities = [sensor_twist(one, data.window.rig.T_lidar_ego)[1] for one in motions if one.reaches(LEAST_SPEED_MPS)]
     if not velocities:
         return shift_m
-    way = T_camera_lidar[:3, :3] @ np.mean(velocities, axis=0)
-    return np.asarray(shift_m - way * (way @ shift_m) / max(float(way @ way), LEAST_SPEED_MPS**2))
+    way_mps = T_camera_lidar[:3, :3] @ np.mean(velocities, axis=0)
+    late_s = float(way_mps @ shift_m) / max(float(way_mps @ way_mps), LEAST_SPEED_MPS**2)
+    return np.asarray(shift_m - way_mps * min(max(late_s, -MOST_LATE_S), MOST_LATE_S))
 
 
 def _other_cloud_axes(data: WindowData) -> Mistake | None:
