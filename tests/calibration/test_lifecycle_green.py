@@ -19,6 +19,7 @@ from coec.calibration.monitor.sensor_faults import CAUSES
 from coec.calibration.state import ExtrinsicHold, PairState
 from coec.calibration.state_machine import HealthState
 from coec.calibration.types import Decision, Estimate
+from coec.geometry import se3
 from coec.service.engine.check_progress import CheckProgress
 from coec.service.ingest.decoder import CAMERA, LIDAR, StreamCounts
 from coec.service.ingest.pair_stream import SelectionStatistics, StreamStatistics
@@ -28,6 +29,8 @@ PERIOD_S = RULES.monitor.period_s
 LASTS_S = ACQUITTAL_PERIODS * PERIOD_S
 CODES = ("time_offset", "ego_motion_wrong", "dark", "open_field", "lidar_beams_lost")
 STEPS = 40
+NEGLIGIBLE_STEP = np.array([*np.radians([0.05, 0.05, 0.05]), 0.01, 0.01, 0.01])
+"""By how much an extrinsic may change without a new check."""
 
 
 @dataclass
@@ -62,7 +65,7 @@ class World:
         """Takes a step as the service does: progress, and then a look at the clocks. `completed_s`: sensor time of the
         last pair of a check, or accepted window, that was completed."""
         self.log.append(f"{self.now_s} {what}: {self.state.health.value} -> {after.health.value}")
-        if not np.array_equal(after.T_camera_lidar, self.state.T_camera_lidar):
+        if (np.abs(se3.difference(after.T_camera_lidar, self.state.T_camera_lidar)) > NEGLIGIBLE_STEP).any():
             self.acquitted_s, self.at_rest = None, False
         self.state = after
         if completed_s is not None:

@@ -7,7 +7,7 @@ survives a restart.
 
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from math import degrees, fsum, sqrt
+from math import degrees, fsum, radians, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -379,12 +379,17 @@ def _applied_or_waiting(
     return happened(state, HealthEvent.CONTRADICTED, why, waits)
 
 
+NEGLIGIBLE_STEP = np.array([*[radians(0.05)] * 3, *[0.01] * 3])
+"""By how much (rad, m) an extrinsic may differ along each axis from the one that a check acquitted: no check tells them
+apart. See docs/measured.md."""
+
+
 def _served(state: PairState, pose: Matrix4, estimate: Estimate) -> PairState:
     # A check, however recent, acquits only the extrinsic that it checked.
-    changed = not np.array_equal(pose, state.T_camera_lidar)
+    is_other = bool((np.abs(state_machine.step_between(state.T_camera_lidar, pose)) > NEGLIGIBLE_STEP).any())
     return replace(
         state,
-        monitor=replace(state.monitor, acquitted_ns=None, standstill=None) if changed else state.monitor,
+        monitor=replace(state.monitor, acquitted_ns=None, standstill=None) if is_other else state.monitor,
         T_camera_lidar=pose,
         provenance=Provenance.ESTIMATED,
         valid_from_ns=estimate.data_stamp_ns,
