@@ -33,10 +33,10 @@ from coec.io import user_files
 from coec.io.depth.depth_maps import open_depth
 from coec.io.exported_extrinsic import (
     ExportFrames,
-    export_text,
     extrinsic_of_result,
     require_accepted,
 )
+from coec.io.exports import export_text
 from coec.io.images import GreyImages
 from coec.io.recordings import window_cutting
 from coec.io.recordings.bag import MOTION_LEFT_OUT

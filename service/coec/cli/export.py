@@ -76,7 +76,8 @@ def export(
 ) -> int:
     """Write a calibration into the files of other programs: exit 1 if it is not accepted."""
     from coec.io import user_files as files
-    from coec.io.exported_extrinsic import ExportFrames, export_text, require_accepted, require_format
+    from coec.io.exported_extrinsic import ExportFrames, require_accepted
+    from coec.io.exports import export_text, require_format
 
     require_format(format)
     frames = ExportFrames(parent, child, _pose(parent_pose))
@@ -121,7 +122,8 @@ def _of_window(path: Path, frames: ExportFrames) -> ExportedExtrinsic:
 
 
 def _of_document(path: Path, camera: CameraIntrinsics | None, frames: ExportFrames) -> ExportedExtrinsic:
-    from coec.io.exported_extrinsic import MAX_EXPORT_BYTES, extrinsic_of_reply, extrinsic_of_result
+    from coec.io.exported_extrinsic import extrinsic_of_reply, extrinsic_of_result
+    from coec.io.exports import MAX_EXPORT_BYTES
     from coec.io.user_files import read_bytes
     from coec.schemas.message import from_json
     from coec.schemas.replies import CalibrationResult, ExtrinsicReply

@@ -6,7 +6,6 @@ import math
 import re
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,19 +13,14 @@ from numpy.typing import NDArray
 import coec
 from coec.calibration.types import NS_PER_S
 from coec.config import CameraIntrinsics
-from coec.errors import NotAcceptedError, OutputError, SourceError, UsageError
+from coec.errors import NotAcceptedError, OutputError
 from coec.geometry import cameras, se3
-from coec.io import user_files
-from coec.io.exports import FORMATS
 from coec.io.rig_files import camera_of, intrinsics_config
 from coec.io.serialise import estimate_of, intrinsics_of, matrix_of, number_or_null
 from coec.schemas.replies import AXES, CalibrationResult, ExtrinsicReply, Intrinsics
 
 Matrix = NDArray[np.float64]
 
-
-MAX_EXPORT_BYTES = 64 * 2**20
-"""Largest file that is read or changed by an export, bytes. A robot's URDF has less than one million."""
 
 REFUSED = "REFUSED - do not use"
 """Stands above every pose of a refused result that can be copied."""
@@ -323,36 +317,3 @@ def require_accepted(extrinsic: ExportedExtrinsic, name: str, override: str, *, 
             f"{name}: not accepted: {' '.join(extrinsic.origin.rejection_reasons)} "
             f"`{override}` exports it all the same, and says so in the file."
         )
-
-
-def export_text(extrinsic: ExportedExtrinsic, form: str, path: Path | None) -> str:
-    """The new text of the file `path` (None: there is none). Its present content stays where the format has room for
-    it.
-
-    Raises:
-        UsageError: no such format.
-        SourceError: the present file cannot be read, or is not text.
-        OutputError: the present content cannot be changed.
-    """
-    require_format(form)
-    return FORMATS[form].text(extrinsic, None if path is None else _present_text(path))
-
-
-def require_format(form: str) -> None:
-    """Returns if the format exists.
-
-    Raises:
-        UsageError: there is no such format; the message lists those that exist.
-    """
-    if form not in FORMATS:
-        raise UsageError(f"format {form}: known are {', '.join(FORMATS)}")
-
-
-def _present_text(path: Path) -> str | None:
-    """Text of the file that is to be changed; None where there is no file."""
-    if not path.exists():
-        return None
-    try:
-        return user_files.read_bytes(path, MAX_EXPORT_BYTES).decode()
-    except UnicodeDecodeError as error:
-        raise SourceError(f"{path} is not UTF-8 text: it cannot be changed") from error

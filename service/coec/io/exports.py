@@ -21,9 +21,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
-from coec.errors import OutputError
+from coec.errors import OutputError, SourceError, UsageError
+from coec.io import user_files
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from ruamel.yaml.comments import CommentedMap
 
     from coec.calibration.types import Matrix4
@@ -47,6 +50,9 @@ class Format(NamedTuple):
 FORMATS: dict[str, Format] = {}
 """All formats, by the names that a user writes."""
 
+MAX_EXPORT_BYTES = 64 * 2**20
+"""Largest file that is read or changed by an export, bytes. A robot's URDF has less than one million."""
+
 JSON, PLAIN, YAML, XML = "application/json", "text/plain", "application/yaml", "application/xml"
 
 
@@ -56,6 +62,39 @@ def _format(name: str, encoding: str) -> Callable[[Callable[..., str]], Callable
         return text
 
     return register
+
+
+def export_text(extrinsic: ExportedExtrinsic, form: str, path: Path | None) -> str:
+    """The new text of the file `path` (None: there is none). Its present content stays where the format has room for
+    it.
+
+    Raises:
+        UsageError: no such format.
+        SourceError: the present file cannot be read, or is not text.
+        OutputError: the present content cannot be changed.
+    """
+    require_format(form)
+    return FORMATS[form].text(extrinsic, None if path is None else _present_text(path))
+
+
+def require_format(form: str) -> None:
+    """Returns if the format exists.
+
+    Raises:
+        UsageError: there is no such format; the message lists those that exist.
+    """
+    if form not in FORMATS:
+        raise UsageError(f"format {form}: known are {', '.join(FORMATS)}")
+
+
+def _present_text(path: Path) -> str | None:
+    """Text of the file that is to be changed; None where there is no file."""
+    if not path.exists():
+        return None
+    try:
+        return user_files.read_bytes(path, MAX_EXPORT_BYTES).decode()
+    except UnicodeDecodeError as error:
+        raise SourceError(f"{path} is not UTF-8 text: it cannot be changed") from error
 
 
 @_format("autoware", YAML)
