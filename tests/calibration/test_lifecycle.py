@@ -607,3 +607,14 @@ def test_an_estimate_read_back_from_disk_is_reported_and_has_not_been_checked() 
     assert restored(initial_state(RIG)).provenance is Provenance.NOMINAL
     red = restored(replace(watched(HEALTHY, *flagged_from(200, 3))))
     assert red.health is HealthState.MISCALIBRATED
+
+
+@pytest.mark.parametrize(("turned_deg", "health"), [(0.02, HealthState.HEALTHY), (0.15, HealthState.UNKNOWN)])
+def test_an_old_window_keeps_what_checks_acquitted_if_it_hardly_changes_the_extrinsic(
+    turned_deg: float, health: HealthState
+) -> None:
+    state = watched(solved(initial_state(RIG), estimate(0.0, 250)), check(300))
+    assert state.health is HealthState.HEALTHY
+    after = after_estimate(state, estimate(turned_deg, 260), 210 * S, RULES, 300 * S)
+    assert not np.array_equal(after.T_camera_lidar, state.T_camera_lidar)
+    assert after.health is health
