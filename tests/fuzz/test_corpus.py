@@ -76,6 +76,16 @@ def test_ego(held: Replay) -> None:
     held("ego")
 
 
+@pytest.mark.fault("a cloud that is packed, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
+def test_packed(held: Replay) -> None:
+    held("packed")
+
+
+@pytest.mark.fault("messages of an odometry, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
+def test_odometry(held: Replay) -> None:
+    held("odometry")
+
+
 @pytest.mark.fault("a ROS message of any type, of any bytes", "a value or an error of ours, within 5 s and 500 MB")
 def test_cdr(held: Replay) -> None:
     held("cdr")

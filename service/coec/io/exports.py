@@ -22,7 +22,6 @@ from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
 from coec.errors import OutputError, SourceError, UsageError
-from coec.io import user_files
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -89,6 +88,8 @@ def require_format(form: str) -> None:
 
 def _present_text(path: Path) -> str | None:
     """Text of the file that is to be changed; None where there is no file."""
+    from coec.io import user_files
+
     if not path.exists():
         return None
     try:
