@@ -317,7 +317,7 @@ def _wherever_shifted(given: Ranked, ranked: Sequence[Ranked], rig: Rig) -> Rank
     best = max(shifted, key=lambda one: one.significance, default=given)
     if best.significance <= given.significance:
         return given
-    log_posterior = 0.5 * best.significance**2 + log(AS_GIVEN_ODDS) + _log_prior_of_centre(rig.camera)
+    log_posterior = _log_posterior_as_given(best.significance, rig.camera)
     return replace(best, supposition=given.supposition, log_posterior=log_posterior)
 
 
@@ -329,6 +329,8 @@ def _other_translation(
     vehicle whose clocks are off."""
     rig, end = data.window.rig, given.T_camera_lidar
     pose = rig.T_camera_lidar_nominal if solved is None else solved
+    if float(np.linalg.norm(_shift_m(pose, end))) < KNOWN_TO_M:
+        return None
     turning = _local_ascent(edges, given.supposition, (pose, rig.T_camera_lidar_nominal), axes=3)
     held = _settled(edges, turning, given.null, axes=3)
     shift_m = _shift_m(held.T_camera_lidar, end)
@@ -339,8 +341,6 @@ def _other_translation(
     certain = given.log_posterior + log_prior >= float(np.logaddexp.reduce(rivals)) + log(LEAST_ODDS)
     across_m = float(np.linalg.norm(_across_the_way(data, end, shift_m)))
     if not certain or held.significance > GROSS * given.significance or across_m < max(KNOWN_TO_M, 0.5 * distance_m):
-        return None
-    if float(np.linalg.norm(_shift_m(pose, end))) < KNOWN_TO_M:
         return None
     alike = (
         one
@@ -359,12 +359,7 @@ def _other_translation(
 
 def _shift_m(T_from: Matrix4, T_to: Matrix4) -> NDArray[np.float64]:
     """(3,) from the camera's centre in one pose (4, 4) to that in another, along the axes of the other camera."""
-    return np.asarray(T_to[:3, :3] @ (_centre(T_to) - _centre(T_from)))
-
-
-def _centre(T_camera_lidar: Matrix4) -> NDArray[np.float64]:
-    """(3,) the camera's centre, LiDAR frame, metres."""
-    return np.asarray(-T_camera_lidar[:3, :3].T @ T_camera_lidar[:3, 3])
+    return -se3.difference(T_to, T_from)[3:]
 
 
 def _across_the_way(data: WindowData, T_camera_lidar: Matrix4, shift_m: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -661,8 +656,7 @@ def _settled(edges: Edges, ascended: Ranked, null: Null | None = None, axes: int
     if null is None:
         null = z[looking].mean(axis=0), np.maximum(1.0, z[looking].std(axis=0))
     significance = float(np.linalg.norm(np.maximum((z[0] - null[0]) / null[1], 0.0)))
-    log_posterior = 0.5 * significance**2 + log(AS_GIVEN_ODDS)
-    log_posterior += _log_prior_of_centre(ascended.supposition.camera)
+    log_posterior = _log_posterior_as_given(significance, ascended.supposition.camera)
     return Ranked(ascended.supposition, end, significance, float(square[0]), null, log_posterior)
 
 
@@ -686,6 +680,10 @@ def _with_priors(ranked: Sequence[Ranked], variants: Mapping[tuple[str, str], in
         log_posterior = 0.5 * max(best.significance, 0.0) ** 2 + log_prior
         probable.append(replace(one, significance=best.significance, log_posterior=log_posterior))
     return sorted(probable, key=lambda one: -one.log_posterior)
+
+
+def _log_posterior_as_given(significance: float, camera: Camera) -> float:
+    return 0.5 * significance**2 + log(AS_GIVEN_ODDS) + _log_prior_of_centre(camera)
 
 
 def _log_prior_of_centre(camera: Camera) -> float:
