@@ -15,8 +15,6 @@ from typing import get_args
 import numpy as np
 import zenoh
 
-from coec.calibration.frames.evidence import compensated_for
-from coec.calibration.frames.pairing import motion_at
 from coec.calibration.types import NS_PER_S, CameraFrame, EgoMotion, Frame, LidarFrame
 from coec.cli.doctor.environment import cause_of_silence, fail, ok, warn
 from coec.config import IDENTITY, CameraMessage, Config, EgoMessage, LidarMessage, PacketMessage, PairConfig
@@ -24,6 +22,7 @@ from coec.errors import DecodeError
 from coec.io.depth.depth_maps import STEREO
 from coec.io.images import Inspector
 from coec.io.logs import LossCounter
+from coec.io.recordings.bag_recognition import compensated
 from coec.io.recordings.clocks import offset_cause
 from coec.io.zenoh.bus import Bus, InputSample, StreamInput, direct
 from coec.io.zenoh.ros_node import RosSide, RosTopicList, listed
@@ -423,14 +422,10 @@ def _with_motion(pair: PairConfig, camera: Sequence[tuple[int, int]], ego: Seque
 
 def _compensated(pair: PairConfig, sweeps: Sequence[Frame], motions: Sequence[Frame]) -> Iterator[Finding]:
     """The finding on sweeps that the driver has compensated for motion; none while the vehicle stands."""
-    known = [one for one in motions if isinstance(one, EgoMotion)]
-    moving = []
-    for sweep in sweeps:
-        motion = motion_at(known, sweep.stamp_ns, round(pair.pairing.motion_tolerance_s * NS_PER_S))
-        if isinstance(sweep, LidarFrame) and motion is not None:
-            moving.append((sweep, motion))
+    of_lidar = [one for one in sweeps if isinstance(one, LidarFrame)]
+    of_vehicle = [one for one in motions if isinstance(one, EgoMotion)]
     T_lidar_ego = np.array(pair.ego.T_lidar_ego if pair.ego is not None else IDENTITY, np.float64)
-    instant = compensated_for(moving, T_lidar_ego)
+    instant, _ = compensated(of_lidar, of_vehicle, T_lidar_ego)
     if instant is not None:
         text = f"the points are compensated for motion already, for the {instant} of each sweep"
         advice = "let the driver publish raw points, or set calibration.motion_compensation: false"
