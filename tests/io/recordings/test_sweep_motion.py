@@ -18,16 +18,16 @@ WITHOUT = f"{DRIVE}&faults=no-ego:0-9"
 with_search = pytest.mark.skipif(not nearest_neighbours.installed(), reason="the extra `lidars` is not installed")
 
 
-def loaded(source: str, pairs: int = 2) -> LoadedWindow:
-    return window_of_recording(rendered_source(source), pairs, lambda *_: None)
+def loaded(source: str) -> LoadedWindow:
+    return window_of_recording(rendered_source(source), 2, lambda *_: None)
 
 
 @pytest.mark.fault("a recording of a drive without odometry", "the motion is measured from sweep to sweep")
 @with_search
 def test_the_motion_is_measured_from_sweep_to_sweep() -> None:
-    measured, known = loaded(WITHOUT, 1), loaded(DRIVE, 1)
+    measured, known = loaded(WITHOUT), loaded(DRIVE)
     assert [one.code for one in measured.recognitions] == ["motion_registered"]
-    assert "for 1 of 1 pairs" in measured.recognitions[0].text
+    assert "for 2 of 2 pairs" in measured.recognitions[0].text
     for ours, theirs in zip(measured.window.pairs, known.window.pairs, strict=True):
         assert compensation(ours, measured.window.rig, enabled=True) is Compensation.DONE
         assert ours.motion is not None
